@@ -1,0 +1,1 @@
+"""The companion-computer service: frames in, MAVLink setpoints rewritten on their way."""

@@ -1,0 +1,34 @@
+"""The one place where time comes from. Everything else is given ``now_ns``."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Monotonic time and waiting, injected by the service.
+
+    A simulator may give its own, which steps time when every loop is idle.
+    """
+
+    def now_ns(self) -> int:
+        """Return monotonic time in ns, comparable across the processes of one machine."""
+        ...
+
+    async def sleep_until_ns(self, when_ns: int) -> None:
+        """Return at or after ``when_ns``; at once when that has passed."""
+        ...
+
+
+class RealClock:
+    """CLOCK_MONOTONIC of this machine."""
+
+    def now_ns(self) -> int:
+        """Return monotonic time in ns."""
+        return time.monotonic_ns()
+
+    async def sleep_until_ns(self, when_ns: int) -> None:
+        """Sleep on the event loop until ``when_ns``."""
+        await asyncio.sleep(max(0, when_ns - time.monotonic_ns()) / 1e9)

@@ -1,0 +1,345 @@
+"""The configuration: one frozen model, read strictly from TOML.
+
+Every key has a unit in its name where it has one, a range, a default and an explanation; the commented
+default file (``companion config --default``) is generated from here, so that the two cannot disagree.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class SourceConfig(_Section):
+    """Where frames come from."""
+
+    kind: Annotated[
+        Literal["file", "socket"],
+        Field(
+            description="file: a video file or a folder of images. socket: raw grey frames over loopback TCP, sent by a simulator or another program."
+        ),
+    ] = "file"
+    path: Annotated[
+        str,
+        Field(
+            description="file: the video, or the folder of images (sorted by name; times from its timestamps.csv, else from fps)."
+        ),
+    ] = ""
+    address: Annotated[str, Field(description="socket: HOST:PORT that sends the frames.")] = "127.0.0.1:5600"
+    playback: Annotated[
+        Literal["recorded", "fastest"], Field(description="file: at recorded speed, or as fast as possible.")
+    ] = "recorded"
+    loop: Annotated[
+        bool,
+        Field(description="file: start again at the end. Otherwise the source ends and detection stops."),
+    ] = False
+    fps: Annotated[
+        float, Field(gt=0, le=1000, description="file: frame rate where the recording does not say (Hz).")
+    ] = 10.0
+    min_rate_hz: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=200,
+            description="Below this measured frame rate there is no detection, and that is announced. Larger: stricter.",
+        ),
+    ] = 2.0
+    timeout_s: Annotated[
+        float,
+        Field(gt=0, le=60, description="No frame for this long: the camera counts as dead and is reopened."),
+    ] = 1.0
+
+
+class CameraConfig(_Section):
+    """The camera and how it is mounted."""
+
+    hfov_deg: Annotated[
+        float,
+        Field(
+            gt=5,
+            lt=170,
+            description="Horizontal field of view, used when no calibration file is given (deg).",
+        ),
+    ] = 70.0
+    file: Annotated[
+        str, Field(description="Camera file (TOML) with intrinsics and distortion; empty: hfov_deg alone.")
+    ] = ""
+    mount_roll_deg: Annotated[
+        float,
+        Field(ge=-180, le=180, description="Rotation of the camera about the body's forward axis (deg)."),
+    ] = 0.0
+    mount_pitch_deg: Annotated[
+        float, Field(ge=-90, le=90, description="Camera tilt; positive looks up (deg).")
+    ] = 0.0
+    mount_yaw_deg: Annotated[
+        float, Field(ge=-180, le=180, description="Camera pan; positive looks to the right (deg).")
+    ] = 0.0
+
+
+class DetectorConfig(_Section):
+    """The detector in its worker process."""
+
+    preset: Annotated[
+        Literal["default", "paper"],
+        Field(description="Parameter set: default (measured best) or paper (literal)."),
+    ] = "default"
+    params_file: Annotated[
+        str,
+        Field(
+            description="TOML file with detector parameters that replace those of the preset; empty: none."
+        ),
+    ] = ""
+    deadline_s: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=60,
+            description="A pair that takes longer counts as hung: the worker is killed and restarted.",
+        ),
+    ] = 3.0
+    start_timeout_s: Annotated[
+        float, Field(gt=0, le=300, description="Time allowed for the worker to start (imports included).")
+    ] = 60.0
+    restart_delay_s: Annotated[
+        float,
+        Field(gt=0, le=60, description="First delay before a restart; doubles up to restart_delay_max_s."),
+    ] = 0.2
+    restart_delay_max_s: Annotated[
+        float, Field(gt=0, le=600, description="Longest delay between restarts.")
+    ] = 5.0
+    threads: Annotated[
+        int,
+        Field(
+            ge=1, le=64, description="OpenCV and BLAS threads of the worker. Leave one core to the service."
+        ),
+    ] = 1
+
+
+class LinkConfig(_Section):
+    """The two UDP sides of the inline proxy."""
+
+    planner: Annotated[
+        str,
+        Field(
+            pattern=r"^udp(in|out):[^:]+:\d{1,5}$",
+            description="Planner and ground-station side. udpin:HOST:PORT listens, udpout:HOST:PORT sends first.",
+        ),
+    ] = "udpin:127.0.0.1:14540"
+    autopilot: Annotated[
+        str, Field(pattern=r"^udp(in|out):[^:]+:\d{1,5}$", description="Autopilot side, in the same form.")
+    ] = "udpin:127.0.0.1:14541"
+    component_id: Annotated[
+        int, Field(ge=1, le=255, description="Our own component id (191 MAV_COMP_ID_ONBOARD_COMPUTER).")
+    ] = 191
+    signing: Annotated[
+        Literal["forward"], Field(description="Signed setpoints: forward untouched, with an alarm.")
+    ] = "forward"
+
+
+class GuidanceConfig(_Section):
+    """The switch S: how a planner's setpoint is followed, replaced, turned or held."""
+
+    allow_unprotected: Annotated[
+        bool,
+        Field(
+            description="Not ready (no camera, no worker, no pose): true forwards the planner's setpoints untouched, false holds."
+        ),
+    ] = False
+    max_step_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=20,
+            description="Longest horizontal step from the vehicle to a setpoint sent while protected (m). Larger: faster, longer to stop.",
+        ),
+    ] = 1.5
+    step_margin_m: Annotated[
+        float,
+        Field(ge=0, le=5, description="Kept between the end of a step and the nearest thing seen there (m)."),
+    ] = 0.8
+    agree_deg: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=90,
+            description="The void agrees with the planner when it lies within this angle of the bearing (deg). Larger: the planner is followed more often.",
+        ),
+    ] = 12.0
+    agree_hysteresis_deg: Annotated[
+        float, Field(ge=0, le=45, description="Extra angle before agreement is lost again (deg).")
+    ] = 5.0
+    view_deg: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=90,
+            description="Half angle about the camera's axis within which a bearing counts as in view (deg).",
+        ),
+    ] = 25.0
+    align_deg: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=90,
+            description="No translation while the commanded direction is further than this off the heading (deg).",
+        ),
+    ] = 20.0
+    yaw_rate_deg_s: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=180,
+            description="Cap of the commanded yaw's rate (deg/s). Autopilots do not all cap it themselves.",
+        ),
+    ] = 30.0
+    commit_distance_m: Annotated[
+        float,
+        Field(
+            gt=0, le=20, description="Distance flown along a void before looking towards the goal again (m)."
+        ),
+    ] = 1.5
+    wall_k: Annotated[
+        int,
+        Field(
+            ge=1, le=20, description="Single-plane answers needed among the last wall_n to call it a wall."
+        ),
+    ] = 2
+    wall_n: Annotated[int, Field(ge=1, le=20, description="Window of answers that wall_k counts in.")] = 3
+    wall_limit_m: Annotated[
+        float, Field(gt=0, le=50, description="A plane further away than this is not a wall yet (m).")
+    ] = 3.0
+    wall_margin_m: Annotated[
+        float,
+        Field(
+            ge=0, le=10, description="Added to min(goal, wall_limit_m) when a plane's range is judged (m)."
+        ),
+    ] = 0.5
+    turn_step_deg: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=90,
+            description="Yaw step of a turn in front of a wall (deg). At most half the field of view.",
+        ),
+    ] = 30.0
+    probe_step_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=2,
+            description="Step flown to get parallax after a turn (m). Must exceed the detector's baseline.",
+        ),
+    ] = 0.4
+    bootstrap_probe: Annotated[
+        bool,
+        Field(
+            description="Allow one step along the camera's axis per heading where nothing was seen or flown yet."
+        ),
+    ] = True
+    hold_probe_s: Annotated[
+        float,
+        Field(
+            gt=0, le=60, description="HOLD without parallax for this long, planner wants to move: PROBE (s)."
+        ),
+    ] = 1.0
+    arrive_radius_m: Annotated[
+        float,
+        Field(ge=0, le=10, description="A goal nearer than this, stationary, is flown to directly (m)."),
+    ] = 0.6
+    goal_settle_s: Annotated[
+        float, Field(ge=0, le=60, description="A goal that has not moved for this long is stationary (s).")
+    ] = 1.0
+    episode_distance_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=50,
+            description="An avoidance episode (side of turn, blocked bearings) ends after this distance (m).",
+        ),
+    ] = 3.0
+    redetect_distance_m: Annotated[
+        float, Field(gt=0, le=10, description="An answer is used up after this distance from its frame (m).")
+    ] = 1.0
+    redetect_yaw_deg: Annotated[
+        float,
+        Field(gt=0, le=180, description="An answer is used up after this much yaw from its frame (deg)."),
+    ] = 25.0
+    detection_max_age_s: Annotated[
+        float, Field(gt=0, le=60, description="Greatest age of an answer while moving (s).")
+    ] = 2.0
+    detection_max_age_hover_s: Annotated[
+        float, Field(gt=0, le=600, description="Greatest age of an answer at rest (s).")
+    ] = 10.0
+    moving_m_s: Annotated[
+        float, Field(gt=0, le=5, description="Above this speed the vehicle counts as moving (m/s).")
+    ] = 0.15
+    report_timeout_s: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=60,
+            description="No report of any kind from the worker for this long: vision counts as dead (s).",
+        ),
+    ] = 1.5
+    pose_max_age_s: Annotated[float, Field(gt=0, le=5, description="Greatest age of the pose (s).")] = 0.5
+    planner_timeout_s: Annotated[
+        float, Field(gt=0, le=60, description="Silence after which the planner's goal is forgotten (s).")
+    ] = 1.0
+    estimator_jump_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=20,
+            description="A position jump larger than this beyond what the speed explains is an estimator reset (m).",
+        ),
+    ] = 1.0
+    give_up_s: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=3600,
+            description="HOLD for this long while the planner wants to move: give up, announced (s).",
+        ),
+    ] = 60.0
+    give_up: Annotated[
+        Literal["stay", "autopilot_hold"],
+        Field(
+            description="On giving up: stay in HOLD, or ask the autopilot once for its own Hold/Brake mode."
+        ),
+    ] = "stay"
+
+
+class LogConfig(_Section):
+    """Logs."""
+
+    level: Annotated[
+        Literal["debug", "info", "warning", "error"], Field(description="Least severity that is logged.")
+    ] = "info"
+    format: Annotated[
+        Literal["auto", "text", "json"],
+        Field(description="auto: text on a terminal, JSON otherwise (systemd, files, pipes)."),
+    ] = "auto"
+    status_interval_s: Annotated[
+        float,
+        Field(
+            ge=0, le=3600, description="A status line with all rates and ages every so often; 0: never (s)."
+        ),
+    ] = 10.0
+    detections: Annotated[bool, Field(description="One line for each detection report.")] = False
+    setpoints: Annotated[bool, Field(description="One line for each setpoint decision.")] = False
+
+
+class Config(_Section):
+    """The whole configuration."""
+
+    source: SourceConfig = SourceConfig()
+    camera: CameraConfig = CameraConfig()
+    detector: DetectorConfig = DetectorConfig()
+    link: LinkConfig = LinkConfig()
+    guidance: GuidanceConfig = GuidanceConfig()
+    log: LogConfig = LogConfig()

@@ -1,0 +1,95 @@
+"""What the decisions are made from: poses and detection reports, each with the time when it was true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """The vehicle at one time.
+
+    Attributes
+    ----------
+    time_ns
+        Our monotonic time at which it was true.
+    north_m, east_m, down_m
+        Position of the body in local NED.
+    q_ned_from_body
+        Unit quaternion (w, x, y, z), body FRD to local NED.
+    """
+
+    time_ns: int
+    north_m: float
+    east_m: float
+    down_m: float
+    q_ned_from_body: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class BearingRange:
+    """Free distance measured along one azimuth from where the frame was taken.
+
+    Attributes
+    ----------
+    azimuth_rad
+        Local NED, 0 = north, clockwise, in (-pi, pi].
+    distance_m
+        Distance to the nearest thing seen within the vehicle's width around that azimuth.
+    spread_m
+        Its robust standard deviation.
+    samples
+        Optical flow vectors behind it.
+    """
+
+    azimuth_rad: float
+    distance_m: float
+    spread_m: float
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionReport:
+    """One answer of the vision worker. A missing report is never replaced by an older one.
+
+    Attributes
+    ----------
+    frame_seq, frame_ns
+        The second frame of the pair: its number and when it was exposed (our monotonic time).
+    kind
+        ``vanishing_point``, ``lowest_flow``, ``single_plane`` or ``none``.
+    reason
+        The detector's reason where kind is ``none``, else "".
+    detail
+        Figures behind the reason, for people.
+    x_px, y_px
+        The direction in the image, where there is one.
+    ray_body
+        The direction as a unit vector in body FRD, where there is one and the camera is known.
+    pose
+        The pose the detector was given for this frame, if any.
+    baseline_m
+        Metres flown between the two frames of the pair, where poses are known.
+    distance_m, distance_spread_m
+        Metric time to contact along the direction, or to the plane; None when not known.
+    bearings
+        Free distance by azimuth. An azimuth that is not listed is unknown, and unknown is not free.
+    detector_s
+        Seconds that the detector took.
+    """
+
+    frame_seq: int
+    frame_ns: int
+    kind: str
+    reason: str = ""
+    detail: str = ""
+    x_px: float | None = None
+    y_px: float | None = None
+    ray_body: tuple[float, float, float] | None = None
+    pose: Pose | None = None
+    baseline_m: float | None = None
+    time_to_contact_frames: float | None = None
+    distance_m: float | None = None
+    distance_spread_m: float | None = None
+    bearings: tuple[BearingRange, ...] = ()
+    detector_s: float = 0.0

@@ -1,0 +1,1 @@
+"""Framing, codec, links, proxy and our own identity on MAVLink."""

@@ -1,0 +1,1 @@
+"""Fake autopilot, vehicle, planner and camera world: part of the product."""

@@ -1,0 +1,1 @@
+"""Void detection from two frames of one camera: arrays in, frozen dataclasses out."""

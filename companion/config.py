@@ -278,6 +278,17 @@ class GuidanceConfig(_Section):
     moving_m_s: Annotated[
         float, Field(gt=0, le=5, description="Above this speed the vehicle counts as moving (m/s).")
     ] = 0.15
+    bad_reports_to_hold: Annotated[
+        int,
+        Field(
+            ge=1,
+            le=20,
+            description="Reports without an answer in a row (too little texture, blurred, ...; not: no motion) that end the last answer.",
+        ),
+    ] = 2
+    probe_timeout_s: Annotated[
+        float, Field(gt=0, le=60, description="A probe that brought no answer in this time has failed (s).")
+    ] = 5.0
     report_timeout_s: Annotated[
         float,
         Field(

@@ -79,7 +79,8 @@ def r_body_from_camera(
     With all angles zero the camera looks along the body's forward axis, its image upright. Positive
     pitch looks up, positive yaw looks to the right, positive roll tilts it clockwise seen from behind.
     """
-    return r_from_euler(mount_roll_rad, mount_pitch_rad, mount_yaw_rad) @ _BODY_FROM_UNTILTED_CAMERA
+    tilt = r_from_euler(mount_roll_rad, mount_pitch_rad, mount_yaw_rad)
+    return np.asarray(tilt @ _BODY_FROM_UNTILTED_CAMERA, dtype=np.float64)
 
 
 def azimuth_of_body_ray(ray_body: tuple[float, float, float], q_ned_from_body: Quaternion) -> float | None:

@@ -1,0 +1,146 @@
+"""What the switch S remembers of the world: bearings seen free, the track just flown, bearings found blocked."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from companion.config import GuidanceConfig
+from companion.guidance.coordinates import wrap_rad
+from companion.guidance.freshness import expiry
+from companion.guidance.observation import BearingRange, DetectionReport, Pose
+
+_BIN_RAD = math.radians(3.0)
+_MATCH_RAD = math.radians(4.0)
+"""A bearing stands for directions this close to it (half the vehicle's width at 5 m)."""
+
+
+class SeenBearings:
+    """Free distances by azimuth, as measured lately. An azimuth not in here is unknown, not free."""
+
+    def __init__(self, limits: GuidanceConfig) -> None:
+        self._limits = limits
+        self._by_bin: dict[int, tuple[BearingRange, DetectionReport]] = {}
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._by_bin.clear()
+
+    def add(self, report: DetectionReport) -> None:
+        """Take the bearings of one report; a newer measurement replaces the older one of its azimuth."""
+        if report.pose is None:
+            return
+        for bearing in report.bearings:
+            self._by_bin[round(bearing.azimuth_rad / _BIN_RAD)] = (bearing, report)
+
+    def free_m(self, azimuth_rad: float, pose: Pose, speed_m_s: float, now_ns: int) -> float | None:
+        """Return the free distance from the vehicle along an azimuth, or None where it is not known.
+
+        The least of the fresh measurements within 4 degrees, less their spread and less the way flown
+        along the azimuth since.
+        """
+        found: float | None = None
+        for bearing, report in self._fresh(pose, speed_m_s, now_ns):
+            if abs(wrap_rad(bearing.azimuth_rad - azimuth_rad)) > _MATCH_RAD:
+                continue
+            free_m = _remaining_m(bearing, report, pose)
+            found = free_m if found is None else min(found, free_m)
+        return found
+
+    def free_azimuths(
+        self, at_least_m: float, pose: Pose, speed_m_s: float, now_ns: int
+    ) -> list[tuple[float, float]]:
+        """Return (azimuth_rad, free distance in m) of all bearings known free that far."""
+        return [
+            (bearing.azimuth_rad, free_m)
+            for bearing, report in self._fresh(pose, speed_m_s, now_ns)
+            if (free_m := _remaining_m(bearing, report, pose)) >= at_least_m
+        ]
+
+    def _fresh(self, pose: Pose, speed_m_s: float, now_ns: int) -> list[tuple[BearingRange, DetectionReport]]:
+        # A bearing is a direction in the world: turning the vehicle does not make it worse, so only the
+        # limits on distance and age count here.
+        reports = {id(report): report for _, report in self._by_bin.values()}
+        turned_free = self._limits.model_copy(update={"redetect_yaw_deg": 180.0})
+        good = {
+            key for key, report in reports.items() if not expiry(report, pose, speed_m_s, now_ns, turned_free)
+        }
+        return [(bearing, report) for bearing, report in self._by_bin.values() if id(report) in good]
+
+
+def _remaining_m(bearing: BearingRange, report: DetectionReport, pose: Pose) -> float:
+    origin = report.pose
+    if origin is None:  # add() keeps no report without a pose
+        return 0.0
+    flown_m = (pose.north_m - origin.north_m) * math.cos(bearing.azimuth_rad) + (
+        pose.east_m - origin.east_m
+    ) * math.sin(bearing.azimuth_rad)
+    return max(0.0, bearing.distance_m - bearing.spread_m - flown_m)
+
+
+class Track:
+    """The horizontal track just flown: where the vehicle has been is free."""
+
+    def __init__(self, *, spacing_m: float = 0.1, length_m: float = 5.0) -> None:
+        self._spacing_m = spacing_m
+        self._points: deque[tuple[float, float]] = deque(maxlen=max(2, round(length_m / spacing_m)))
+
+    def clear(self) -> None:
+        """Forget the track (estimator reset, mode left)."""
+        self._points.clear()
+
+    def add(self, north_m: float, east_m: float) -> None:
+        """Take the vehicle's position."""
+        if not self._points or math.dist(self._points[-1], (north_m, east_m)) >= self._spacing_m:
+            self._points.append((north_m, east_m))
+
+    def back(self, north_m: float, east_m: float, distance_m: float) -> tuple[float, float] | None:
+        """Return the latest point of the track at least ``distance_m`` from here, or None."""
+        for point in reversed(self._points):
+            if math.dist(point, (north_m, east_m)) >= distance_m:
+                return point
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class _Blocked:
+    azimuth_rad: float
+    north_m: float
+    east_m: float
+
+
+class Episode:
+    """One avoidance: the side of its turns, how far they have swept, and what was found blocked or probed.
+
+    It ends after ``episode_distance_m`` from where it began, or on a new goal.
+    """
+
+    def __init__(self, north_m: float, east_m: float) -> None:
+        self.north_m = north_m
+        self.east_m = east_m
+        self.side: int = 0
+        self.sweep_rad = 0.0
+        self._blocked: list[_Blocked] = []
+        self._bootstrapped_rad: list[float] = []
+
+    def over(self, pose: Pose, distance_m: float) -> bool:
+        """Whether the vehicle has left the place of this episode."""
+        return math.dist((self.north_m, self.east_m), (pose.north_m, pose.east_m)) > distance_m
+
+    def block(self, azimuth_rad: float, pose: Pose) -> None:
+        """Remember a bearing that was found blocked here."""
+        if not self.is_blocked(azimuth_rad):
+            self._blocked.append(_Blocked(azimuth_rad, pose.north_m, pose.east_m))
+
+    def is_blocked(self, azimuth_rad: float, within_rad: float = math.radians(15.0)) -> bool:
+        """Whether a bearing close to this one was found blocked in this episode."""
+        return any(abs(wrap_rad(b.azimuth_rad - azimuth_rad)) <= within_rad for b in self._blocked)
+
+    def bootstrap(self, look_rad: float) -> None:
+        """Remember that a blind step was taken at this heading."""
+        self._bootstrapped_rad.append(look_rad)
+
+    def was_bootstrapped(self, look_rad: float, within_rad: float) -> bool:
+        """Whether a blind step was taken close to this heading in this episode."""
+        return any(abs(wrap_rad(b - look_rad)) < within_rad for b in self._bootstrapped_rad)

@@ -6,13 +6,64 @@ default file (``companion config --default``) is generated from here, so that th
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+
+@dataclass(frozen=True, slots=True)
+class Disagreement:
+    """Two keys, each right by itself, that cannot both hold.
+
+    Attributes
+    ----------
+    key
+        Dotted below the table that was checked.
+    found, allowed
+        For people.
+    """
+
+    key: str
+    found: str
+    allowed: str
+
+
+class DisagreementError(ValueError):
+    """Carries every disagreement of one table through pydantic's validation."""
+
+    def __init__(self, disagreements: tuple[Disagreement, ...]) -> None:
+        super().__init__("; ".join(f"{d.key}: found {d.found}; allowed: {d.allowed}" for d in disagreements))
+        self.disagreements = disagreements
+
+
+def _checked_host_port(address: str) -> str:
+    host, _, port = address.rpartition(":")
+    if not host or not (port.isascii() and port.isdecimal()) or not 1 <= int(port) <= 65535:
+        raise ValueError("HOST:PORT with a port from 1 to 65535")
+    return address
+
+
+def _checked_udp_endpoint(endpoint: str) -> str:
+    port = int(endpoint.rpartition(":")[2])
+    least = 0 if endpoint.startswith("udpin:") else 1
+    if not least <= port <= 65535:
+        raise ValueError(f"a port from {least} to 65535" + (" (0: any free one)" if least == 0 else ""))
+    return endpoint
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    def _disagreements(self) -> tuple[Disagreement, ...]:
+        """Return what is wrong between keys that are right one by one."""
+        return ()
+
+    @model_validator(mode="after")
+    def _check_between_keys(self) -> Self:
+        if found := self._disagreements():
+            raise DisagreementError(found)
+        return self
 
 
 class SourceConfig(_Section):
@@ -30,7 +81,11 @@ class SourceConfig(_Section):
             description="file: the video, or the folder of images (sorted by name; times from its timestamps.csv, else from fps)."
         ),
     ] = ""
-    address: Annotated[str, Field(description="socket: HOST:PORT that sends the frames.")] = "127.0.0.1:5600"
+    address: Annotated[
+        str,
+        AfterValidator(_checked_host_port),
+        Field(description="socket: HOST:PORT that sends the frames.", examples=["127.0.0.1:5600"]),
+    ] = "127.0.0.1:5600"
     playback: Annotated[
         Literal["recorded", "fastest"], Field(description="file: at recorded speed, or as fast as possible.")
     ] = "recorded"
@@ -119,6 +174,17 @@ class DetectorConfig(_Section):
         ),
     ] = 1
 
+    def _disagreements(self) -> tuple[Disagreement, ...]:
+        if self.restart_delay_s <= self.restart_delay_max_s:
+            return ()
+        return (
+            Disagreement(
+                "restart_delay_s",
+                str(self.restart_delay_s),
+                f"at most restart_delay_max_s, which is {self.restart_delay_max_s}",
+            ),
+        )
+
 
 class LinkConfig(_Section):
     """The two UDP sides of the inline proxy."""
@@ -126,12 +192,20 @@ class LinkConfig(_Section):
     planner: Annotated[
         str,
         Field(
-            pattern=r"^udp(in|out):[^:]+:\d{1,5}$",
+            pattern=r"^udp(in|out):[^:]+:[0-9]{1,5}$",
             description="Planner and ground-station side. udpin:HOST:PORT listens, udpout:HOST:PORT sends first.",
+            examples=["udpin:127.0.0.1:14540", "udpout:192.168.1.20:14550"],
         ),
+        AfterValidator(_checked_udp_endpoint),
     ] = "udpin:127.0.0.1:14540"
     autopilot: Annotated[
-        str, Field(pattern=r"^udp(in|out):[^:]+:\d{1,5}$", description="Autopilot side, in the same form.")
+        str,
+        Field(
+            pattern=r"^udp(in|out):[^:]+:[0-9]{1,5}$",
+            description="Autopilot side, in the same form.",
+            examples=["udpin:127.0.0.1:14541", "udpout:127.0.0.1:14580"],
+        ),
+        AfterValidator(_checked_udp_endpoint),
     ] = "udpin:127.0.0.1:14541"
     component_id: Annotated[
         int, Field(ge=1, le=255, description="Our own component id (191 MAV_COMP_ID_ONBOARD_COMPUTER).")
@@ -139,6 +213,12 @@ class LinkConfig(_Section):
     signing: Annotated[
         Literal["forward"], Field(description="Signed setpoints: forward untouched, with an alarm.")
     ] = "forward"
+
+    def _disagreements(self) -> tuple[Disagreement, ...]:
+        same = self.planner == self.autopilot and not self.planner.endswith(":0")
+        if not same:
+            return ()
+        return (Disagreement("autopilot", f'"{self.autopilot}"', "another endpoint than planner's"),)
 
 
 class GuidanceConfig(_Section):
@@ -324,6 +404,20 @@ class GuidanceConfig(_Section):
         ),
     ] = "stay"
 
+    def _disagreements(self) -> tuple[Disagreement, ...]:
+        found: list[Disagreement] = []
+        if self.wall_k > self.wall_n:
+            found.append(Disagreement("wall_k", str(self.wall_k), f"at most wall_n, which is {self.wall_n}"))
+        if self.detection_max_age_s > self.detection_max_age_hover_s:
+            found.append(
+                Disagreement(
+                    "detection_max_age_s",
+                    str(self.detection_max_age_s),
+                    f"at most detection_max_age_hover_s, which is {self.detection_max_age_hover_s}",
+                )
+            )
+        return tuple(found)
+
 
 class LogConfig(_Section):
     """Logs."""
@@ -354,3 +448,20 @@ class Config(_Section):
     link: LinkConfig = LinkConfig()
     guidance: GuidanceConfig = GuidanceConfig()
     log: LogConfig = LogConfig()
+
+    def _disagreements(self) -> tuple[Disagreement, ...]:
+        if self.camera.file:  # the field of view is then known only to whoever reads that file
+            return ()
+        half_view_deg = self.camera.hfov_deg / 2
+        return tuple(
+            Disagreement(
+                f"guidance.{key}",
+                str(value_deg),
+                f"at most half of camera.hfov_deg, which is {half_view_deg:g}",
+            )
+            for key, value_deg in (
+                ("view_deg", self.guidance.view_deg),
+                ("turn_step_deg", self.guidance.turn_step_deg),
+            )
+            if value_deg > half_view_deg
+        )

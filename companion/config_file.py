@@ -1,0 +1,220 @@
+"""The configuration as a file: read strictly, and written with every key explained.
+
+All faults of a file are reported at once, one a line, each with the file, the key, what was found and
+what is allowed. The default file and those messages are made from the models in ``companion.config``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+import textwrap
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from companion.config import CameraConfig, Config, DetectorConfig, DisagreementError, SourceConfig
+from companion.errors import ConfigError
+
+_MAX_FILE_BYTES = 1 << 20
+_MAX_SHOWN = 60
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def load_config(path: str | Path) -> Config:
+    """Read a configuration file.
+
+    Relative paths in it (``source.path``, ``camera.file``, ``detector.params_file``) are taken as relative
+    to the file's own folder.
+
+    Parameters
+    ----------
+    path
+        A TOML file. Keys that it leaves out have their defaults.
+
+    Raises
+    ------
+    companion.errors.ConfigError
+        With every fault of the file, one a line.
+    """
+    path = Path(path)
+    return _resolve_paths(parse_config(_read_text(path), name=str(path)), path.absolute().parent)
+
+
+def parse_config(text: str, *, name: str = "configuration") -> Config:
+    """Read a configuration from TOML text; ``name`` stands in messages for the file.
+
+    Raises
+    ------
+    companion.errors.ConfigError
+        With every fault of the text, one a line.
+    """
+    try:
+        table = tomllib.loads(text)
+    except ValueError as error:  # TOMLDecodeError is one; a number of thousands of digits raises a bare one
+        raise ConfigError(f"{name}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{name}: not valid TOML: nested too deeply") from error
+    try:
+        return Config.model_validate(table)
+    except ValidationError as error:
+        lines = [line for details in error.errors() for line in _fault_lines(details, table)]
+        raise ConfigError("\n".join(f"{name}: {line}" for line in lines)) from error
+
+
+def default_toml() -> str:
+    """Return a TOML file of all defaults, with meaning, range or choices beside every key."""
+    parts = [
+        "# Configuration of the void companion. Every key is optional; the values here are the defaults.\n",
+        "# Relative paths are relative to this file's folder.\n",
+    ]
+    for section, schema in _section_schemas().items():
+        parts.append(f"\n{_comment(schema['description'])}[{section}]\n")
+        for key, facts in schema["properties"].items():
+            default = _toml(facts["default"])
+            allowed = _allowed(facts)
+            parts.append(
+                f"\n{_comment(facts['description'])}"
+                f"{_comment(f'Allowed: {allowed}. Default: {default}')}"
+                f"{key} = {default}\n"
+            )
+    return "".join(parts)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            # One byte more than allowed, and never the whole of an endless device.
+            data = file.read(_MAX_FILE_BYTES + 1)
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file") from error
+    except IsADirectoryError as error:
+        raise ConfigError(f"{path}: is a folder; give the configuration file itself") from error
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ConfigError(f"{path}: cannot be read: {reason}") from error
+    if len(data) > _MAX_FILE_BYTES:
+        raise ConfigError(f"{path}: larger than {_MAX_FILE_BYTES} bytes, which no configuration is")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ConfigError(f"{path}: not UTF-8 text: byte 0x{data[error.start]:02x} in line {line}") from error
+
+
+def _resolve_paths(config: Config, folder: Path) -> Config:
+    def resolved(value: str) -> str:
+        return str(folder / value) if value else value
+
+    source: SourceConfig = config.source.model_copy(update={"path": resolved(config.source.path)})
+    camera: CameraConfig = config.camera.model_copy(update={"file": resolved(config.camera.file)})
+    detector: DetectorConfig = config.detector.model_copy(
+        update={"params_file": resolved(config.detector.params_file)}
+    )
+    return config.model_copy(update={"source": source, "camera": camera, "detector": detector})
+
+
+def _section_schemas() -> dict[str, dict[str, Any]]:
+    """Return the JSON schema of each section, by its name in the file."""
+    schema = Config.model_json_schema()
+    return {
+        section: schema["$defs"][facts["$ref"].rpartition("/")[2]]
+        for section, facts in schema["properties"].items()
+    }
+
+
+def _fault_lines(details: ErrorDetails, table: Mapping[str, Any]) -> list[str]:
+    """Return one line a fault, without the file's name."""
+    loc = tuple(str(part) for part in details["loc"])
+    raised = details.get("ctx", {}).get("error")
+    if isinstance(raised, DisagreementError):
+        return [
+            f"{_dotted((*loc, *d.key.split('.')))}: found {d.found}; allowed: {d.allowed}"
+            for d in raised.disagreements
+        ]
+    if details["type"] == "extra_forbidden":
+        return [_unknown_key_line(loc, table)]
+    found = f"{_dotted(loc)}: found {_shown(details['input'])}"
+    schemas = _section_schemas()
+    if len(loc) == 1:
+        return [f"{found}; allowed: a table, [{loc[0]}]"]
+    if isinstance(raised, ValueError):
+        return [f"{found}; allowed: {raised}"]
+    return [f"{found}; allowed: {_allowed(schemas[loc[0]]['properties'][loc[1]])}"]
+
+
+def _unknown_key_line(loc: tuple[str, ...], table: Mapping[str, Any]) -> str:
+    schemas = _section_schemas()
+    key = loc[-1]
+    if len(loc) > 1:
+        known: Sequence[str] = list(schemas[loc[0]]["properties"])
+        line = f"{_dotted(loc)}: unknown key"
+    else:
+        known = list(schemas)
+        line = f"{_dotted(loc)}: unknown {'table' if isinstance(table.get(key), dict) else 'key'}"
+    if near := difflib.get_close_matches(key.lower(), known, n=1, cutoff=0.6):
+        return f"{line}; did you mean {_dotted((*loc[:-1], near[0]))}?"
+    homes = [section for section, schema in schemas.items() if key in schema["properties"]]
+    if homes:
+        return f"{line}; did you mean {_dotted((homes[0], key))}?"
+    return f"{line}; allowed here: {', '.join(known)}"
+
+
+def _allowed(facts: Mapping[str, Any]) -> str:
+    """Return what a key may hold, in words, from its JSON schema."""
+    if "const" in facts:
+        return f"only {_toml(facts['const'])}"
+    if "enum" in facts:
+        return "one of " + ", ".join(_toml(choice) for choice in facts["enum"])
+    if facts["type"] == "boolean":
+        return "true or false"
+    if facts["type"] == "string":
+        if examples := facts.get("examples"):
+            return "text such as " + " or ".join(_toml(example) for example in examples)
+        return "text"
+    bounds = [
+        f"{word} {facts[bound]:g}"
+        for bound, word in (
+            ("minimum", "from"),
+            ("exclusiveMinimum", "above"),
+            ("maximum", "up to"),
+            ("exclusiveMaximum", "below"),
+        )
+        if bound in facts
+    ]
+    noun = "whole number" if facts["type"] == "integer" else "number"
+    return f"{noun} {' and '.join(bounds)}" if bounds else noun
+
+
+def _dotted(loc: Sequence[str]) -> str:
+    return ".".join(part if _BARE_KEY.fullmatch(part) else json.dumps(part)[:_MAX_SHOWN] for part in loc)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, dict):
+        return "a table"
+    if isinstance(value, list):
+        return "a list"
+    if isinstance(value, bool | int | float | str):
+        text = _toml(value)
+        return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
+    return f"{value} (a date or time)"
+
+
+def _toml(value: bool | float | str) -> str:
+    """Return one value as TOML writes it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)  # a TOML basic string escapes as JSON does
+    return repr(value)
+
+
+def _comment(text: str) -> str:
+    lines = textwrap.wrap(text, width=98, break_long_words=False, break_on_hyphens=False)
+    return "".join(f"# {line}\n" for line in lines)

@@ -1,1 +1,1 @@
-"""Frame sources."""
+"""Frame sources: recordings and raw frames over a socket, newest frame first."""

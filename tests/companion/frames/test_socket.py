@@ -34,17 +34,24 @@ async def until(holds) -> None:
 
 
 @contextlib.asynccontextmanager
-async def sender(talk):
+async def sender(talk, port: int = 0):
     """Serve each connection with `talk(reader, writer)`."""
+    talks: list[asyncio.Task] = []
 
     async def serve(reader, writer):
+        talks.append(asyncio.current_task())
         with contextlib.suppress(ConnectionError):
             await talk(reader, writer)
         writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()
 
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    async with server:
+    server = await asyncio.start_server(serve, "127.0.0.1", port)
+    try:
         yield server.sockets[0].getsockname()[1]
+    finally:
+        server.close()
+        await asyncio.gather(*talks)
 
 
 @pytest.fixture
@@ -155,17 +162,20 @@ async def test_a_sender_that_is_not_there_yet_is_waited_for_and_announced_once(e
     async with sender(lambda reader, writer: asyncio.sleep(0)) as port:
         pass  # the port is free again
 
-    async with SocketSource("127.0.0.1", port, clock=RealClock(), log=events[0]) as source:
-        await asyncio.sleep(0.5)
+    async def talk(reader, writer):
+        writer.write(now_frame(1))
+        await reader.read()
 
-        async def talk(reader, writer):
-            writer.write(now_frame(1))
-            await reader.read()
+    source = SocketSource("127.0.0.1", port, clock=RealClock(), log=events[0])
 
-        server = await asyncio.start_server(talk, "127.0.0.1", port)
-        async with asyncio.timeout(20):
-            frame = await anext(source.frames())
-        server.close()
+    async def receive():
+        async with source:
+            return await anext(source.frames())
+
+    receiving = asyncio.create_task(receive())
+    await asyncio.sleep(0.5)
+    async with sender(talk, port), asyncio.timeout(20):
+        frame = await receiving
     assert frame.seq == 1
     await asyncio.sleep(0.1)
     assert [record["event"] for record in events[1]()] == ["frame_stream_lost", "frame_stream_connected"]

@@ -334,7 +334,9 @@ class Framer:
             anchored = accepted
         else:
             self.counters.garbage_bytes += size - position
-        if not self._passed:  # else older bytes are watched already, and these with them
+        if self._passed:  # older bytes are watched already: go on to here
+            self._passed_over = len(self._passed) - (size - position)
+        else:
             self._watch(buffer, candidates, uncovered_from, position)
 
 

@@ -1,0 +1,208 @@
+"""What we read of the autopilot's telemetry, as small values (pure).
+
+A message whose needed fields are not finite is `Unusable`, with the reason: it is never half used.
+https://mavlink.io/en/messages/common.html
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from companion.mavlink.framing import RawFrame
+
+MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
+MAV_AUTOPILOT_INVALID: Final = 8
+MAV_AUTOPILOT_PX4: Final = 12
+
+_CUSTOM_MODE_ENABLED: Final = 1
+_SAFETY_ARMED: Final = 128
+_PX4_MAIN_OFFBOARD: Final = 6
+_COPTER_GUIDED: Final = 4
+_COPTER_TYPES: Final = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
+"""MAV_TYPE of the vehicles that ArduCopter flies: the numbers of its modes mean others on a plane or rover."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """HEARTBEAT, with the system and component that sent it."""
+
+    system_id: int
+    component_id: int
+    type: int
+    autopilot: int
+    base_mode: int
+    custom_mode: int
+    system_status: int
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """ATTITUDE: Euler angles (rad) and body rates (rad/s), body FRD to local NED."""
+
+    time_boot_ms: int
+    roll: float
+    pitch: float
+    yaw: float
+    rollspeed: float
+    pitchspeed: float
+    yawspeed: float
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeQuaternion:
+    """ATTITUDE_QUATERNION: (w, x, y, z), body FRD to local NED, of length 1 within rounding."""
+
+    time_boot_ms: int
+    q_ned_from_body: tuple[float, float, float, float]
+    rollspeed: float
+    pitchspeed: float
+    yawspeed: float
+
+
+@dataclass(frozen=True, slots=True)
+class LocalPosition:
+    """LOCAL_POSITION_NED: position (m) and velocity (m/s)."""
+
+    time_boot_ms: int
+    x: float
+    y: float
+    z: float
+    vx: float
+    vy: float
+    vz: float
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """What is needed of ODOMETRY: ``reset_counter`` grows with every jump of the estimate."""
+
+    time_usec: int
+    reset_counter: int
+
+
+@dataclass(frozen=True, slots=True)
+class ExtendedSysState:
+    """EXTENDED_SYS_STATE; landed_state: 0 undefined, 1 on ground, 2 in air, 3 taking off, 4 landing."""
+
+    vtol_state: int
+    landed_state: int
+
+
+@dataclass(frozen=True, slots=True)
+class Unusable:
+    """A message of interest that cannot be used, and why."""
+
+    message_id: int
+    reason: str
+
+
+Telemetry = Heartbeat | Attitude | AttitudeQuaternion | LocalPosition | Odometry | ExtendedSysState
+
+
+class VehicleMode(NamedTuple):
+    """Whether the vehicle is armed, and whether it takes setpoints (PX4 OFFBOARD, ArduCopter GUIDED)."""
+
+    armed: bool
+    offboard: bool
+
+
+_HEARTBEAT: Final = struct.Struct("<IBBBBB")
+_SIX_FLOATS: Final = struct.Struct("<I6f")
+_QUATERNION: Final = struct.Struct("<I7f")
+_TIME_USEC: Final = struct.Struct("<Q")
+_RESET_COUNTER_OFFSET: Final = 230
+_ODOMETRY_BYTES: Final = 233
+_QUATERNION_LENGTH_TOLERANCE: Final = 0.01
+
+
+def decode(frame: RawFrame) -> Telemetry | Unusable:
+    """Return the message of one of `MESSAGE_IDS` as a value.
+
+    Raises
+    ------
+    ValueError
+        When the frame is of another message.
+    """
+    reader = _READERS.get(frame.message_id)
+    if reader is None:
+        raise ValueError(f"message {frame.message_id} is not read; only {sorted(MESSAGE_IDS)} are")
+    return reader(frame)
+
+
+def vehicle_mode(heartbeat: Heartbeat) -> VehicleMode:
+    """Return what an autopilot's HEARTBEAT says of its mode.
+
+    PX4: ``custom_mode = main << 16 | sub << 24``, OFFBOARD is main mode 6. ArduCopter: GUIDED is 4.
+    Any other autopilot, and ArduPilot on anything but a copter, never counts as taking setpoints.
+    """
+    armed = bool(heartbeat.base_mode & _SAFETY_ARMED)
+    offboard = False
+    if heartbeat.base_mode & _CUSTOM_MODE_ENABLED:
+        if heartbeat.autopilot == MAV_AUTOPILOT_PX4:
+            offboard = heartbeat.custom_mode >> 16 & 0xFF == _PX4_MAIN_OFFBOARD
+        elif heartbeat.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+            offboard = heartbeat.type in _COPTER_TYPES and heartbeat.custom_mode == _COPTER_GUIDED
+    return VehicleMode(armed, offboard)
+
+
+def _heartbeat(frame: RawFrame) -> Heartbeat:
+    custom_mode, kind, autopilot, base_mode, status = _HEARTBEAT.unpack_from(_padded(frame, 9))[:5]
+    return Heartbeat(frame.system_id, frame.component_id, kind, autopilot, base_mode, custom_mode, status)
+
+
+def _attitude(frame: RawFrame) -> Attitude | Unusable:
+    values = _SIX_FLOATS.unpack_from(_padded(frame, _SIX_FLOATS.size))
+    return Attitude(*values) if _finite(values) else Unusable(frame.message_id, "not finite")
+
+
+def _local_position(frame: RawFrame) -> LocalPosition | Unusable:
+    values = _SIX_FLOATS.unpack_from(_padded(frame, _SIX_FLOATS.size))
+    return LocalPosition(*values) if _finite(values) else Unusable(frame.message_id, "not finite")
+
+
+def _attitude_quaternion(frame: RawFrame) -> AttitudeQuaternion | Unusable:
+    values = _QUATERNION.unpack_from(_padded(frame, _QUATERNION.size))
+    if not _finite(values):
+        return Unusable(frame.message_id, "not finite")
+    time_boot_ms, w, x, y, z, rollspeed, pitchspeed, yawspeed = values
+    length = math.hypot(w, x, y, z)
+    if abs(length - 1.0) > _QUATERNION_LENGTH_TOLERANCE:
+        return Unusable(frame.message_id, f"quaternion of length {length:.3g}")
+    q = (w / length, x / length, y / length, z / length)
+    return AttitudeQuaternion(time_boot_ms, q, rollspeed, pitchspeed, yawspeed)
+
+
+def _odometry(frame: RawFrame) -> Odometry:
+    payload = _padded(frame, _ODOMETRY_BYTES)
+    return Odometry(_TIME_USEC.unpack_from(payload)[0], payload[_RESET_COUNTER_OFFSET])
+
+
+def _extended_sys_state(frame: RawFrame) -> ExtendedSysState:
+    payload = _padded(frame, 2)
+    return ExtendedSysState(payload[0], payload[1])
+
+
+def _padded(frame: RawFrame, size: int) -> bytes:
+    """Return the payload with the zeros that MAVLink 2 trims."""
+    return frame.payload.ljust(size, b"\0")
+
+
+def _finite(values: tuple[float, ...]) -> bool:
+    return all(map(math.isfinite, values))
+
+
+_READERS: Final[dict[int, Callable[[RawFrame], Telemetry | Unusable]]] = {
+    0: _heartbeat,
+    30: _attitude,
+    31: _attitude_quaternion,
+    32: _local_position,
+    245: _extended_sys_state,
+    331: _odometry,
+}
+
+MESSAGE_IDS: Final = frozenset(_READERS)
+"""Ids of the messages that `decode` reads."""

@@ -55,8 +55,10 @@ class FrameReader:
     def read(self, datagram: bytes) -> Iterator[ReceivedFrame]:
         """Yield the sound frames of one datagram; the other bytes are counted in ``bad_bytes``."""
         place = 0
+        in_step = True
         while place < len(datagram):
-            frame = self._frame_at(datagram, place)
+            frame = self._frame_at(datagram, place, in_step=in_step)
+            in_step = frame is not None
             if frame is None:
                 self.bad_bytes += 1
                 place += 1
@@ -64,7 +66,7 @@ class FrameReader:
                 yield frame
                 place += len(frame.raw)
 
-    def _frame_at(self, datagram: bytes, place: int) -> ReceivedFrame | None:
+    def _frame_at(self, datagram: bytes, place: int, *, in_step: bool) -> ReceivedFrame | None:
         length = _frame_length(datagram, place)
         if length is None or place + length > len(datagram):
             return None
@@ -79,9 +81,9 @@ class FrameReader:
         else:
             seq, system_id, component_id, message_id = raw[2:6]
         if isinstance(message, mavlink.MAVLink_unknown):
-            # Its CRC says nothing to us: believe it only where the next frame, or the end, follows.
+            # Its CRC says nothing to us: believe it only between a frame and a frame, or the datagram's ends.
             end = place + length
-            if end < len(datagram) and datagram[end] not in (_V1, _V2):
+            if not in_step or (end < len(datagram) and datagram[end] not in (_V1, _V2)):
                 return None
             return ReceivedFrame(raw, f"UNKNOWN_{message_id}", None, seq, system_id, component_id)
         return ReceivedFrame(raw, message.get_type(), message, seq, system_id, component_id)

@@ -1,0 +1,105 @@
+"""The worker process: reads frames from shared memory, runs the pipeline, answers.
+
+Started by ``worker_process`` as ``python -m companion.vision.child_process PARENT_PID SOCKET_FD``. It ends
+when its socket is closed, when its parent dies in whatever way, and after an exception.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import faulthandler
+import os
+import signal
+import socket
+import sys
+import traceback
+
+from companion.errors import ConfigError
+from companion.frames.source import Frame
+from companion.vision.frame_slots import MappedSlots
+from companion.vision.messages import (
+    MAX_PACKET_BYTES,
+    Answer,
+    Detect,
+    Failed,
+    FromWorker,
+    MapSlots,
+    Ready,
+    Start,
+    ToWorker,
+    Unusable,
+    pack_from_worker,
+    unpack_to_worker,
+)
+from companion.vision.pipeline import Pipeline, load_factory
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_MAX_TRACEBACK = 20_000
+
+
+def main() -> int:
+    """Run the worker process; return its exit status."""
+    parent_pid, socket_fd = (int(argument) for argument in sys.argv[1:3])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the service, which ends this process
+    faulthandler.enable()
+    _die_with_parent(parent_pid)
+    with socket.socket(fileno=socket_fd) as connection:
+        try:
+            return _serve(connection)
+        except Exception as error:  # noqa: BLE001  whatever it is, the service gets to know before the end
+            text = traceback.format_exc()[-_MAX_TRACEBACK:]
+            with contextlib.suppress(OSError):
+                _send(connection, Failed(f"{type(error).__name__}: {error}"[:500], text))
+            return 1
+
+
+def _serve(connection: socket.socket) -> int:
+    pipeline: Pipeline | None = None
+    slots: MappedSlots | None = None
+    while (received := _receive(connection)) is not None:
+        message, fds = received
+        match message:
+            case Start():
+                try:
+                    pipeline = load_factory(message.pipeline)(message.detector, message.camera)
+                except ConfigError as error:
+                    _send(connection, Unusable(str(error)[:_MAX_TRACEBACK]))
+                    return 1
+                _send(connection, Ready())
+            case MapSlots():
+                if slots is not None:
+                    slots.close()
+                slots = MappedSlots(fds[0], message.slot_bytes, message.n_slots)
+            case Detect():
+                if pipeline is None or slots is None:
+                    raise RuntimeError("a frame came before the pipeline and its memory")
+                image = slots.read(message.slot, message.height_px, message.width_px)
+                report = pipeline.detect(Frame(image, message.time_ns, message.seq), message.pose)
+                _send(connection, Answer(message.frame_id, report))
+    return 0
+
+
+def _receive(connection: socket.socket) -> tuple[ToWorker, list[int]] | None:
+    try:
+        packet, fds, _, _ = socket.recv_fds(connection, MAX_PACKET_BYTES, 1)
+    except ConnectionError:
+        return None
+    return (unpack_to_worker(packet), fds) if packet else None
+
+
+def _send(connection: socket.socket, message: FromWorker) -> None:
+    connection.send(pack_from_worker(message))
+
+
+def _die_with_parent(parent_pid: int) -> None:
+    """Have the kernel kill this process when the parent dies, even while the pipeline hangs in C code."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
+    if os.getppid() != parent_pid:  # it died before the line above
+        sys.exit(0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

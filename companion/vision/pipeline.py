@@ -1,0 +1,46 @@
+"""What the worker process runs: frames in, reports out."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Protocol, cast
+
+from companion.config import CameraConfig, DetectorConfig
+from companion.errors import ConfigError
+from companion.frames.source import Frame
+from companion.guidance.observation import DetectionReport, Pose
+
+VOID_PIPELINE = "companion.vision.child:build_pipeline"
+"""The detector itself."""
+
+
+class Pipeline(Protocol):
+    """Turns frames into reports, one at a time, in the order they come."""
+
+    def detect(self, frame: Frame, pose: Pose | None) -> DetectionReport:
+        """Return the report on one frame; ``frame_seq``, ``frame_ns`` and ``pose`` are echoed.
+
+        An exception is reported with its traceback and ends the process.
+        """
+        ...
+
+
+PipelineFactory = Callable[[DetectorConfig, CameraConfig], Pipeline]
+"""Builds a pipeline; raises ``companion.errors.ConfigError`` when the configuration cannot be used."""
+
+
+def load_factory(name: str) -> PipelineFactory:
+    """Return the factory of a name in the form ``package.module:function``.
+
+    Raises
+    ------
+    companion.errors.ConfigError
+        When there is none.
+    """
+    module_name, _, function_name = name.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module_name), function_name)
+    except (ModuleNotFoundError, AttributeError, ValueError) as error:
+        raise ConfigError(f"pipeline {name!r} cannot be found: {error}") from error
+    return cast("PipelineFactory", factory)

@@ -1,1 +1,120 @@
-"""Command line of the companion service."""
+"""Command line of the companion service: ``companion run | config | check-config | demo``."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from companion.errors import CompanionError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong usage."""
+    arguments = _parser().parse_args(argv)
+    try:
+        code: int = arguments.command(arguments)
+    except CompanionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="companion",
+        description="Keeps an indoor drone flying toward open space: sits between planner and autopilot on MAVLink.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="run the service until SIGINT or SIGTERM")
+    run.add_argument(
+        "-c", "--config", metavar="FILE.toml", help="configuration; without it the defaults hold"
+    )
+    run.set_defaults(command=_run)
+
+    config = commands.add_parser("config", help="print a configuration")
+    config.add_argument("--default", action="store_true", required=True, help="the commented default file")
+    config.set_defaults(command=_config)
+
+    check = commands.add_parser("check-config", help="say whether a configuration file can be used")
+    check.add_argument("file", metavar="FILE.toml")
+    check.set_defaults(command=_check_config)
+
+    demo = commands.add_parser(
+        "demo",
+        help="run it on embedded data: no camera, no drone",
+        description="Real footage with a fake autopilot and planner through the real service, then a closed-loop "
+        "room with a wall. Ends by itself within two minutes.",
+    )
+    demo.add_argument(
+        "-o", "--output", metavar="DIR", default="out", help="folder for the annotated video (default: out)"
+    )
+    demo.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    demo.set_defaults(command=_demo)
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from companion.clock import RealClock
+    from companion.config import Config
+    from companion.config_file import load_config
+    from companion.log import open_log
+    from companion.service import Service
+
+    config = load_config(arguments.config) if arguments.config else Config()
+
+    async def serve() -> None:
+        service = Service(config, clock=RealClock(), log=log)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, service.stop)
+        await service.run()
+
+    with open_log(config.log) as log:
+        try:
+            asyncio.run(serve())
+        except* CompanionError as group:
+            failure = _first(group)
+            log.critical("service_failed", error=str(failure))
+            return_code = 1
+        else:
+            return_code = 0
+    return return_code
+
+
+def _first(group: BaseExceptionGroup[CompanionError]) -> CompanionError:
+    """Return the first error of a group of groups."""
+    error: BaseException = group
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    if not isinstance(error, CompanionError):
+        raise error
+    return error
+
+
+def _config(arguments: argparse.Namespace) -> int:
+    from companion.config_file import default_toml
+
+    if arguments.default:
+        print(default_toml(), end="")
+    return 0
+
+
+def _check_config(arguments: argparse.Namespace) -> int:
+    from companion.config_file import load_config
+
+    load_config(Path(arguments.file))
+    print(f"{arguments.file}: good")
+    return 0
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from companion.sim.demo import run_demo
+
+    return run_demo(Path(arguments.output), as_json=arguments.json)

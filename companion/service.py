@@ -1,1 +1,198 @@
-"""Composition root."""
+"""The composition root: one TaskGroup of named loops, and what they share.
+
+=============  =========  ==============================================================================
+loop           rate       does
+=============  =========  ==============================================================================
+frames         camera     takes the newest frame, looks up the pose at its time, offers both to vision
+vision         events     owns the worker process: start, deadline, restart (``vision.supervisor``)
+health         10 Hz      judges inputs, tells the switch S of failures, announces changes of state
+heartbeat      1 Hz       our HEARTBEAT, only while health has run
+status         config     one line with all rates and ages
+=============  =========  ==============================================================================
+
+Setpoints have no loop: they are decided and sent in the call that received them (``mavlink.proxy``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from contextlib import AsyncExitStack
+from typing import Any, Final
+
+from companion.clock import Clock
+from companion.config import Config
+from companion.errors import SourceError
+from companion.frames.open import open_source
+from companion.guidance.observation import DetectionReport
+from companion.interception import Interception
+from companion.log import Log
+from companion.mavlink.identity import Identity
+from companion.mavlink.link import UdpEndpoint
+from companion.mavlink.proxy import InlineProxy
+from companion.vision.supervisor import VisionSupervisor
+
+_HEALTH_PERIOD_NS: Final = 100_000_000
+_HEARTBEAT_PERIOD_NS: Final = 1_000_000_000
+_HEALTH_LATE_NS: Final = 1_000_000_000
+"""Health that has not run for this long means that this process does not work: no HEARTBEAT then."""
+_REOPEN_DELAYS_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
+
+
+class Service:
+    """The companion service, from open sockets to a clean end.
+
+    Parameters
+    ----------
+    config
+        The whole configuration.
+    clock
+        Where time comes from.
+    log
+        Takes the events.
+    """
+
+    def __init__(self, config: Config, *, clock: Clock, log: Log) -> None:
+        self._config = config
+        self._clock = clock
+        self._log = log
+        self._stop = asyncio.Event()
+        self._health_ns = clock.now_ns()
+        self._last_frame_ns: int | None = None
+        self._source_fault: str | None = "no frame yet"
+
+    def stop(self) -> None:
+        """End the service; :meth:`run` returns soon after."""
+        self._stop.set()
+
+    async def run(self) -> None:
+        """Run until :meth:`stop`.
+
+        Raises
+        ------
+        companion.errors.CompanionError
+            When a port, the source or the worker's configuration cannot be used at the start.
+        """
+        config, clock, log = self._config, self._clock, self._log
+        async with AsyncExitStack() as stack:
+            planner = UdpEndpoint(config.link.planner, name="link.planner", now_ns=clock.now_ns)
+            autopilot = UdpEndpoint(config.link.autopilot, name="link.autopilot", now_ns=clock.now_ns)
+            await stack.enter_async_context(planner)
+            await stack.enter_async_context(autopilot)
+            identity = Identity(
+                planner, autopilot, component_id=config.link.component_id, now_ns=clock.now_ns
+            )
+            flight = Interception(config, identity=identity, log=log)
+            proxy = InlineProxy(planner, autopilot, flight, now_ns=clock.now_ns)
+
+            def on_report(report: DetectionReport) -> None:
+                flight.on_report(report, clock.now_ns())
+
+            vision = VisionSupervisor(
+                config.detector, config.camera, clock=clock, on_report=on_report, log=log
+            )
+            loops: dict[str, Coroutine[Any, Any, None]] = {
+                "frames": self._frames(flight, vision),
+                "vision": vision.run(),
+                "health": self._health(flight, vision),
+                "heartbeat": self._heartbeat(flight, identity),
+                "status": self._status(flight, vision, proxy),
+            }
+            log.info(
+                "service_started",
+                planner=_listening(planner),
+                autopilot=_listening(autopilot),
+                source=config.source.path or config.source.address,
+                preset=config.detector.preset,
+            )
+            try:
+                async with asyncio.TaskGroup() as group:
+                    tasks = [group.create_task(loop, name=name) for name, loop in loops.items()]
+                    await self._stop.wait()
+                    for task in tasks:
+                        task.cancel()
+            finally:
+                log.info("summary", **flight.statistics.summary(), **proxy.counters.as_dict())
+                log.info("service_stopped")
+
+    # ------------------------------------------------------------------ loops
+
+    async def _frames(self, flight: Interception, vision: VisionSupervisor) -> None:
+        """Take frames for ever: a source that fails or ends is a fault, and is opened again where it can come back."""
+        clock, log, config = self._clock, self._log, self._config.source
+        failures = 0
+        while True:
+            try:
+                source = open_source(config, clock=clock, log=log)
+                async with source:
+                    log.info("source_opened", kind=config.kind)
+                    async for frame in source.frames():
+                        now_ns = clock.now_ns()
+                        if self._last_frame_ns is None and config.kind == "file":
+                            log.info("source_started", started_ns=frame.time_ns)
+                        self._last_frame_ns = now_ns
+                        self._source_fault = None
+                        failures = 0
+                        vision.offer(frame, flight.pose_of(frame, now_ns))
+                self._source_fault = "frame source has ended"
+                log.warning("source_ended")
+                if config.kind == "file":
+                    return
+            except SourceError as error:
+                if self._last_frame_ns is None and config.kind == "file":
+                    raise  # a file that cannot be read will not come back
+                self._source_fault = "frame source failed"
+                log.warning("source_failed", error=str(error))
+            delay_s = _REOPEN_DELAYS_S[min(failures, len(_REOPEN_DELAYS_S) - 1)]
+            failures += 1
+            await clock.sleep_until_ns(clock.now_ns() + int(delay_s * 1e9))
+
+    async def _health(self, flight: Interception, vision: VisionSupervisor) -> None:
+        """Judge every input ten times a second."""
+        clock, config = self._clock, self._config
+        started_ns = clock.now_ns()
+        while True:
+            now_ns = clock.now_ns()
+            camera = self._source_fault
+            if camera is None and self._last_frame_ns is not None:
+                rate_hz = flight.statistics.frames.rate_hz(now_ns)
+                if now_ns - self._last_frame_ns > config.source.timeout_s * 1e9:
+                    camera = "no frames from the camera"
+                elif now_ns - started_ns > 3e9 and rate_hz < config.source.min_rate_hz:
+                    camera = "frame rate below the floor"
+            flight.set_fault("camera", camera, now_ns)
+            status = vision.status
+            worker = None if status.state in ("ready", "busy") else f"vision worker {status.state}"
+            flight.set_fault("worker", worker, now_ns)
+            flight.check_links(now_ns)
+            flight.announce()
+            self._health_ns = now_ns
+            await clock.sleep_until_ns(now_ns + _HEALTH_PERIOD_NS)
+
+    async def _heartbeat(self, flight: Interception, identity: Identity) -> None:
+        """Send our HEARTBEAT, fed by the loops that it speaks for."""
+        while True:
+            now_ns = self._clock.now_ns()
+            if now_ns - self._health_ns <= _HEALTH_LATE_NS:
+                identity.heartbeat(flight.mav_state(now_ns))
+            await self._clock.sleep_until_ns(now_ns + _HEARTBEAT_PERIOD_NS)
+
+    async def _status(self, flight: Interception, vision: VisionSupervisor, proxy: InlineProxy) -> None:
+        """Write the status line."""
+        interval_s = self._config.log.status_interval_s
+        if interval_s == 0:
+            return
+        while True:
+            await self._clock.sleep_until_ns(self._clock.now_ns() + int(interval_s * 1e9))
+            self._log.info(
+                "status",
+                **flight.status(self._clock.now_ns()),
+                worker=vision.status.state,
+                worker_restarts=vision.status.restarts,
+                **proxy.counters.as_dict(),
+            )
+
+
+def _listening(endpoint: UdpEndpoint) -> str:
+    host, port = endpoint.local_address
+    return f"{host}:{port}"

@@ -1,0 +1,280 @@
+"""Where MAVLink, vision and the switch S meet: the proxy asks for verdicts here, the worker reports here."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from companion.config import Config
+from companion.frames.source import Frame
+from companion.guidance.coordinates import heading_rad, quaternion_from_euler
+from companion.guidance.observation import DetectionReport, Pose
+from companion.guidance.pose_buffer import PoseBuffer
+from companion.guidance.setpoint import Forward, LocalSetpoint, Rewrite, Verdict
+from companion.guidance.substitution import GaveUp, State, StateChanged, Switch
+from companion.log import Log
+from companion.mavlink.identity import Identity, MavSeverity, MavState
+from companion.mavlink.telemetry import (
+    Attitude,
+    AttitudeQuaternion,
+    ExtendedSysState,
+    Heartbeat,
+    LocalPosition,
+    Odometry,
+    Telemetry,
+    Unusable,
+    vehicle_mode,
+)
+from companion.run_statistics import RunStatistics
+
+_HEARTBEAT_LOST_NS: Final = 3_500_000_000
+
+
+class Interception:
+    """Feeds the switch S with what the autopilot and the worker say, and gives its verdicts to the proxy.
+
+    It implements ``mavlink.proxy.ProxyHandler``; every call returns at once.
+
+    Parameters
+    ----------
+    config
+        The whole configuration.
+    identity
+        Our own component, which announces changes.
+    log
+        Takes the events.
+    """
+
+    def __init__(self, config: Config, *, identity: Identity, log: Log) -> None:
+        guidance = config.guidance
+        self.switch = Switch(guidance, camera_yaw_rad=math.radians(config.camera.mount_yaw_deg))
+        self.statistics = RunStatistics()
+        self._config = config
+        self._identity = identity
+        self._log = log
+        self._poses = PoseBuffer(jump_m=guidance.estimator_jump_m)
+        self._announced_unprotected: set[str] = set()
+        self._unusable: set[tuple[int, str]] = set()
+        self._reset_counter: int | None = None
+        self._autopilot_heartbeat_ns: int | None = None
+        self._heartbeat_lost = False
+        self._report_waiting: DetectionReport | None = None
+        self._last_report: DetectionReport | None = None
+        self._last_verdict: dict[str, Any] = {}
+
+    # ------------------------------------------------------------------ from the proxy
+
+    def on_setpoint(self, setpoint: LocalSetpoint, system_id: int, component_id: int, now_ns: int) -> Verdict:
+        """Return what is sent in place of a planner's position setpoint."""
+        verdict = self.switch.on_setpoint(setpoint, now_ns)
+        self.statistics.setpoints.tick(now_ns)
+        self.announce()
+        if self._report_waiting is not None and self.switch.state is not State.DISENGAGED:
+            waited_ms = (now_ns - self._report_waiting.frame_ns) / 1e6
+            self.statistics.frame_to_setpoint_ms.append(waited_ms)
+            self._report_waiting = None
+        self._last_verdict = _verdict_fields(setpoint, verdict)
+        if self._config.log.setpoints:
+            self._log.info(
+                "setpoint",
+                state=str(self.switch.state),
+                planner=f"{system_id}/{component_id}",
+                **self._last_verdict,
+            )
+        return verdict
+
+    def on_unprotected(self, kind: str, detail: str) -> None:
+        """Announce, once for each kind, that a setpoint passes through as it came."""
+        key = f"{kind}: {detail}"
+        if key in self._announced_unprotected:
+            return
+        self._announced_unprotected.add(key)
+        self._log.warning("setpoint_unprotected", kind=kind, detail=detail)
+        self._identity.status_text(MavSeverity.WARNING, f"void: UNPROTECTED {kind} {detail}")
+
+    def on_telemetry(self, message: Telemetry | Unusable, now_ns: int) -> None:
+        """Take one message of the autopilot's telemetry."""
+        match message:
+            case LocalPosition():
+                reset = self._poses.add_position(
+                    message.time_boot_ms,
+                    now_ns,
+                    (message.x, message.y, message.z),
+                    (message.vx, message.vy, message.vz),
+                )
+                if reset:
+                    self._on_estimator_reset(now_ns, "position jump")
+                self._tell_pose()
+            case Attitude():
+                q = quaternion_from_euler(message.roll, message.pitch, message.yaw)
+                rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
+                if self._poses.add_attitude(message.time_boot_ms, now_ns, q, rates):
+                    self._on_estimator_reset(now_ns, "autopilot restarted")
+            case AttitudeQuaternion():
+                rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
+                if self._poses.add_attitude(message.time_boot_ms, now_ns, message.q_ned_from_body, rates):
+                    self._on_estimator_reset(now_ns, "autopilot restarted")
+            case Odometry():
+                if self._reset_counter not in (None, message.reset_counter):
+                    self._poses.clear()
+                    self._on_estimator_reset(now_ns, "reset counter")
+                self._reset_counter = message.reset_counter
+            case Heartbeat():
+                self._on_heartbeat(message, now_ns)
+            case Unusable():
+                if (message.message_id, message.reason) not in self._unusable:
+                    self._unusable.add((message.message_id, message.reason))
+                    self._log.warning(
+                        "telemetry_unusable", message_id=message.message_id, reason=message.reason
+                    )
+            case ExtendedSysState():
+                pass
+
+    def _on_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
+        if not self._identity.learn(heartbeat):
+            return
+        self._autopilot_heartbeat_ns = now_ns
+        mode = vehicle_mode(heartbeat)
+        self.switch.on_vehicle(armed=mode.armed, offboard=mode.offboard, now_ns=now_ns)
+        self.announce()
+
+    def _on_estimator_reset(self, now_ns: int, why: str) -> None:
+        self._log.warning("estimator_reset", why=why)
+        self.switch.on_estimator_reset(now_ns, why)
+        self.announce()
+
+    def _tell_pose(self) -> None:
+        pose = self._poses.newest()
+        speed_m_s = self._poses.speed_m_s()
+        if pose is not None and speed_m_s is not None:
+            self.switch.on_pose(pose, speed_m_s)
+
+    # ------------------------------------------------------------------ from camera and worker
+
+    def pose_of(self, frame: Frame, now_ns: int) -> Pose | None:
+        """Count a frame and return the vehicle's pose at the time of its exposure, where it is known."""
+        self.statistics.frames_total += 1
+        self.statistics.frames.tick(now_ns)
+        return self._poses.at(frame.time_ns)
+
+    def on_report(self, report: DetectionReport, now_ns: int) -> None:
+        """Take one report of the vision worker."""
+        statistics = self.statistics
+        statistics.reports.tick(now_ns)
+        statistics.detections[report.kind] += 1
+        if report.kind == "none":
+            statistics.reasons[report.reason] += 1
+        statistics.detection_ms.append(1e3 * report.detector_s)
+        self._last_report = report
+        self._report_waiting = report
+        self.switch.on_report(report, now_ns)
+        if self._config.log.detections:
+            self._log.info("detection", **_report_fields(report, now_ns))
+
+    def set_fault(self, name: str, reason: str | None, now_ns: int) -> None:
+        """Tell the switch S of a failing input, or that it works again."""
+        self.switch.set_fault(name, reason, now_ns)
+
+    # ------------------------------------------------------------------ to the outside
+
+    def check_links(self, now_ns: int) -> None:
+        """Announce that the autopilot's heartbeat was lost or is back."""
+        seen = self._autopilot_heartbeat_ns
+        lost = seen is not None and now_ns - seen > _HEARTBEAT_LOST_NS
+        if lost != self._heartbeat_lost:
+            self._heartbeat_lost = lost
+            # The mode stays what it was: protection is not dropped because a heartbeat is missing.
+            if lost:
+                self._log.warning("autopilot_heartbeat_lost")
+            else:
+                self._log.info("autopilot_heartbeat_back")
+
+    def mav_state(self, now_ns: int) -> MavState:
+        """Return what our HEARTBEAT says: BOOT until all inputs were good once, then ACTIVE or CRITICAL."""
+        if self.switch.not_ready(now_ns) is None:
+            return MavState.ACTIVE
+        return MavState.BOOT if not self.statistics.detections else MavState.CRITICAL
+
+    def announce(self) -> None:
+        """Log and send what the switch S has to say."""
+        for event in self.switch.drain_events():
+            match event:
+                case StateChanged():
+                    self._log.info(
+                        "state",
+                        previous=str(event.previous),
+                        state=str(event.state),
+                        reason=event.reason,
+                        time_ns=event.time_ns,
+                    )
+                    self._identity.status_text(_severity(event), f"void: {event.state} {event.reason}")
+                case GaveUp():
+                    self._log.error("gave_up", reason=event.reason, ask_autopilot=event.ask_autopilot)
+                    self._identity.status_text(MavSeverity.CRITICAL, f"void: gave up, {event.reason}")
+                    if event.ask_autopilot:
+                        asked = self._identity.request_hold()
+                        self._log.warning("autopilot_hold_requested", sent=asked)
+
+    def status(self, now_ns: int) -> dict[str, Any]:
+        """Return the state, rates and ages of now, for the status line."""
+        pose = self._poses.newest()
+        statistics = self.statistics
+        fields: dict[str, Any] = {
+            "state": str(self.switch.state),
+            "reason": self.switch.reason,
+            "not_ready": self.switch.not_ready(now_ns),
+            "frames_hz": round(statistics.frames.rate_hz(now_ns), 1),
+            "reports_hz": round(statistics.reports.rate_hz(now_ns), 1),
+            "setpoints_hz": round(statistics.setpoints.rate_hz(now_ns), 1),
+            "pose_age_ms": None if pose is None else round((now_ns - pose.time_ns) / 1e6),
+        }
+        if pose is not None:
+            fields["pose"] = [round(v, 3) for v in (pose.north_m, pose.east_m, pose.down_m)]
+            fields["heading_deg"] = round(math.degrees(heading_rad(pose.q_ned_from_body)), 1)
+        if self._last_report is not None:
+            fields["report"] = _report_fields(self._last_report, now_ns)
+        if self._last_verdict:
+            fields["setpoint"] = self._last_verdict
+        return fields
+
+
+def _severity(event: StateChanged) -> MavSeverity:
+    return MavSeverity.WARNING if event.state is State.HOLD else MavSeverity.INFO
+
+
+def _verdict_fields(setpoint: LocalSetpoint, verdict: Verdict) -> dict[str, Any]:
+    fields: dict[str, Any] = {"planned": [round(v, 3) for v in (setpoint.x, setpoint.y, setpoint.z)]}
+    match verdict:
+        case Rewrite():
+            fields["action"] = verdict.action
+            fields["sent"] = [round(verdict.x, 3), round(verdict.y, 3), round(setpoint.z, 3)]
+            fields["yaw_deg"] = None if verdict.yaw is None else round(math.degrees(verdict.yaw), 1)
+        case Forward():
+            fields["action"] = "forwarded"
+            fields["sent"] = fields["planned"]
+        case _:
+            fields["action"] = "dropped"
+            fields["dropped"] = verdict.reason
+    return fields
+
+
+def _report_fields(report: DetectionReport, now_ns: int) -> dict[str, Any]:
+    fields: dict[str, Any] = {
+        "frame_seq": report.frame_seq,
+        "kind": report.kind,
+        "age_ms": round((now_ns - report.frame_ns) / 1e6),
+        "detector_ms": round(1e3 * report.detector_s),
+    }
+    optional = {
+        "reason": report.reason or None,
+        "detail": report.detail or None,
+        "x_px": report.x_px,
+        "y_px": report.y_px,
+        "baseline_m": report.baseline_m,
+        "distance_m": report.distance_m,
+        "time_to_contact_frames": report.time_to_contact_frames,
+    }
+    for name, value in optional.items():
+        if value is not None:
+            fields[name] = round(value, 3) if isinstance(value, float) else value
+    return fields

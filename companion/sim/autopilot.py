@@ -10,6 +10,7 @@ from typing import Self
 
 from companion.clock import Clock, RealClock
 from companion.errors import LinkError
+from companion.guidance.observation import Pose
 from companion.sim.autopilot_endpoint import Address, AutopilotEndpoint, SetpointRecord
 from companion.sim.commander import Result
 from companion.sim.flight_controller import FlightController
@@ -159,6 +160,12 @@ class FakeAutopilot:
     def true_state(self) -> VehicleState:
         """Where the vehicle really is: differs from ``state`` after a jump of the estimate."""
         return self._controller.true_state
+
+    def true_pose(self) -> Pose:
+        """Return where the vehicle really is, with the time at which that was true: what a camera sees from."""
+        state = self._controller.true_state
+        north_m, east_m, down_m = state.position_ned_m
+        return Pose(self._controller.now_ns, north_m, east_m, down_m, state.q_ned_from_body)
 
     @property
     def position_ned_m(self) -> Vector3:

@@ -72,6 +72,11 @@ class FlightController:
         self._home = self.estimate.position_ned_m
 
     @property
+    def now_ns(self) -> int:
+        """Monotonic time up to which it has been advanced."""
+        return self._now_ns
+
+    @property
     def mode(self) -> FlightMode:
         """The mode it flies in."""
         return self._commander.mode

@@ -1,0 +1,300 @@
+"""The inline proxy: every frame goes through as it came, position setpoints as the handler decides.
+
+Everything happens in the call that received a datagram: no queue, no task, no wait. So order holds, nothing
+can stall, and several frames of one datagram leave as one datagram again.
+
+What happens to a planner's setpoint:
+
+===================================================  ===================================================
+setpoint                                             sent to the autopilot
+===================================================  ===================================================
+a used field is NaN or infinite                      nothing; counted
+signed, or with unknown incompatibility flags        untouched; announced as unprotected
+82, 86, or 84 of a kind that is not handled          untouched; announced as unprotected
+for a system that is not the vehicle                 untouched
+a position in LOCAL_NED                              what the handler says: `Forward`, `Rewrite` or `Drop`
+the handler fails                                    nothing; counted and logged
+===================================================  ===================================================
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+from companion.guidance.setpoint import Drop, Forward, LocalSetpoint, Rewrite, Verdict
+from companion.mavlink import codec, telemetry
+from companion.mavlink.framing import RawFrame
+from companion.mavlink.identity import is_autopilot
+from companion.mavlink.link import FrameReceiver, LinkCounters
+from companion.mavlink.telemetry import Heartbeat, Telemetry, Unusable
+
+_LOG: Final = logging.getLogger(__name__)
+_NAMES: Final = {
+    codec.SET_ATTITUDE_TARGET: "ATTITUDE",
+    codec.SET_POSITION_TARGET_LOCAL_NED: "LOCAL_NED",
+    codec.SET_POSITION_TARGET_GLOBAL_INT: "GLOBAL_INT",
+}
+_ACTIONS: Final = ("substituted", "held", "turned")
+_HEARTBEAT: Final = 0
+_AUTOPILOT_COMPONENT: Final = 1
+_VEHICLE_SILENT_NS: Final = 5_000_000_000
+"""After this another autopilot may become the one whose telemetry counts."""
+
+
+class ProxyHandler(Protocol):
+    """Decides on setpoints and takes telemetry. Every call must return at once."""
+
+    def on_setpoint(self, setpoint: LocalSetpoint, system_id: int, component_id: int, now_ns: int) -> Verdict:
+        """Return what is sent in place of a position setpoint; the ids are the sender's."""
+        ...
+
+    def on_unprotected(self, kind: str, detail: str) -> None:
+        """Take note that a setpoint passes untouched although it moves the vehicle.
+
+        Called for each such setpoint; the words are the same for the same kind.
+
+        Parameters
+        ----------
+        kind
+            ``LOCAL_NED``, ``GLOBAL_INT``, ``ATTITUDE`` or ``signed``.
+        detail
+            What about it is not handled.
+        """
+        ...
+
+    def on_telemetry(self, message: Telemetry | Unusable, now_ns: int) -> None:
+        """Take a message of the vehicle's autopilot; it has been forwarded already."""
+        ...
+
+
+class Endpoint(Protocol):
+    """One side of the proxy: `companion.mavlink.link.UdpEndpoint`, or any other transport."""
+
+    on_frames: FrameReceiver | None
+    counters: LinkCounters
+
+    def send(self, datagram: bytes) -> int:
+        """Send to all peers of this side and return how many took it. Never blocks, never raises."""
+        ...
+
+
+@dataclass(slots=True)
+class ProxyCounters:
+    """What the proxy did.
+
+    Attributes
+    ----------
+    to_autopilot_frames, to_planner_frames
+        Frames passed on, rewritten setpoints included.
+    setpoints_in
+        SET_POSITION_TARGET_LOCAL_NED for the vehicle. Each of them is forwarded, rewritten or dropped.
+    forwarded
+        Those passed on with all their values, unprotected ones included.
+    rewritten
+        By `Rewrite.action`: substituted, held, turned.
+    dropped
+        Setpoints of any message that were not passed on, by reason.
+    unprotected
+        Setpoints of any message that passed untouched although they move the vehicle, by kind.
+    setpoints_elsewhere
+        Setpoints for other systems.
+    handler_errors
+        Failures of the handler, and verdicts that cannot be carried out.
+    unusable_telemetry
+        Messages of interest whose fields could not be used.
+    """
+
+    planner: LinkCounters
+    autopilot: LinkCounters
+    to_autopilot_frames: int = 0
+    to_planner_frames: int = 0
+    setpoints_in: int = 0
+    forwarded: int = 0
+    rewritten: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[str] = field(default_factory=Counter)
+    unprotected: Counter[str] = field(default_factory=Counter)
+    setpoints_elsewhere: int = 0
+    handler_errors: int = 0
+    unusable_telemetry: int = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all counts by name, for logs and summaries."""
+        return {
+            "setpoints_in": self.setpoints_in,
+            "forwarded": self.forwarded,
+            **{action: self.rewritten[action] for action in _ACTIONS},
+            "dropped": dict(self.dropped),
+            "unprotected": dict(self.unprotected),
+            "setpoints_elsewhere": self.setpoints_elsewhere,
+            "to_autopilot_frames": self.to_autopilot_frames,
+            "to_planner_frames": self.to_planner_frames,
+            "handler_errors": self.handler_errors,
+            "unusable_telemetry": self.unusable_telemetry,
+            **{f"planner_{name}": count for name, count in _link_counts(self.planner).items()},
+            **{f"autopilot_{name}": count for name, count in _link_counts(self.autopilot).items()},
+        }
+
+
+class InlineProxy:
+    """Joins the planner's side and the autopilot's.
+
+    Parameters
+    ----------
+    planner, autopilot
+        The two sides; their `on_frames` is taken over.
+    handler
+        Decides on setpoints.
+    now_ns
+        Monotonic time.
+    """
+
+    def __init__(
+        self, planner: Endpoint, autopilot: Endpoint, handler: ProxyHandler, *, now_ns: Callable[[], int]
+    ) -> None:
+        self.counters = ProxyCounters(planner.counters, autopilot.counters)
+        self._planner = planner
+        self._autopilot = autopilot
+        self._handler = handler
+        self._now_ns = now_ns
+        self._vehicle: Heartbeat | None = None
+        self._vehicle_heard_ns = 0
+        self._autopilot_systems: set[int] = set()
+        self._last_failure = ""
+        planner.on_frames = self._from_planner
+        autopilot.on_frames = self._from_autopilot
+
+    @property
+    def vehicle(self) -> Heartbeat | None:
+        """The newest HEARTBEAT of the autopilot whose telemetry counts; None before the first."""
+        return self._vehicle
+
+    # ------------------------------------------------------------------ planner -> autopilot
+
+    def _from_planner(self, frames: list[RawFrame]) -> None:
+        now_ns = self._now_ns()
+        out = [
+            data
+            for frame in frames
+            if (data := frame.data if frame.message_id not in _NAMES else self._setpoint(frame, now_ns))
+        ]
+        if out:
+            self.counters.to_autopilot_frames += len(out)
+            self._autopilot.send(out[0] if len(out) == 1 else b"".join(out))
+
+    def _setpoint(self, frame: RawFrame, now_ns: int) -> bytes:
+        """Return what is sent in place of a setpoint frame; nothing where it is dropped."""
+        counters = self.counters
+        setpoint: LocalSetpoint | None = None
+        match frame.message_id:
+            case codec.SET_POSITION_TARGET_LOCAL_NED:
+                setpoint = codec.unpack_local(frame)
+                nonfinite = setpoint.nonfinite_used_fields()
+            case codec.SET_POSITION_TARGET_GLOBAL_INT:
+                nonfinite = codec.global_nonfinite_used_fields(frame)
+            case _:
+                nonfinite = codec.attitude_nonfinite_used_fields(frame)
+        target = codec.target_system(frame)
+        # Before the autopilot has been heard, every target may be the vehicle.
+        is_elsewhere = bool(target and self._autopilot_systems and target not in self._autopilot_systems)
+        counters.setpoints_in += setpoint is not None and not is_elsewhere
+        if nonfinite:
+            return self._dropped("not finite")
+        if is_elsewhere:
+            counters.setpoints_elsewhere += 1
+            return frame.data
+        name = _NAMES[frame.message_id]
+        if frame.is_signed:
+            return self._unprotected(frame, "signed", name)
+        if frame.incompat_flags:
+            return self._unprotected(frame, name, f"incompatibility flags {frame.incompat_flags:#x}")
+        if setpoint is None:
+            return self._unprotected(frame, name, "not handled")
+        reason = setpoint.unprotected_reason()
+        if reason is not None:
+            return self._unprotected(frame, name, reason)
+        try:
+            verdict = self._handler.on_setpoint(setpoint, frame.system_id, frame.component_id, now_ns)
+            return self._carry_out(verdict, frame)
+        except Exception as error:  # noqa: BLE001  whatever fails there, this setpoint is held back and the rest goes on
+            self._handler_failed("on_setpoint", error)
+            return self._dropped("handler error")
+
+    def _carry_out(self, verdict: Verdict, frame: RawFrame) -> bytes:
+        match verdict:
+            case Forward():
+                data = codec.sanitise(frame)
+                self.counters.forwarded += 1
+                return data
+            case Rewrite():
+                if verdict.action not in _ACTIONS:
+                    raise ValueError(f"action {verdict.action!r}, expected one of {_ACTIONS}")
+                data = codec.rewrite(frame, verdict)
+                self.counters.rewritten[verdict.action] += 1
+                return data
+            case Drop():
+                return self._dropped(verdict.reason)
+        raise TypeError(f"not a verdict: {verdict!r}")
+
+    def _dropped(self, reason: str) -> bytes:
+        self.counters.dropped[reason] += 1
+        return b""
+
+    def _unprotected(self, frame: RawFrame, kind: str, detail: str) -> bytes:
+        self.counters.unprotected[kind] += 1
+        self.counters.forwarded += frame.message_id == codec.SET_POSITION_TARGET_LOCAL_NED
+        try:
+            self._handler.on_unprotected(kind, detail)
+        except Exception as error:  # noqa: BLE001  a failed announcement must not cost the frame
+            self._handler_failed("on_unprotected", error)
+        return frame.data
+
+    # ------------------------------------------------------------------ autopilot -> planner
+
+    def _from_autopilot(self, frames: list[RawFrame]) -> None:
+        self.counters.to_planner_frames += len(frames)
+        self._planner.send(frames[0].data if len(frames) == 1 else b"".join([f.data for f in frames]))
+        now_ns = self._now_ns()
+        for frame in frames:
+            if frame.message_id in telemetry.MESSAGE_IDS and frame.component_id == _AUTOPILOT_COMPONENT:
+                self._telemetry(frame, now_ns)
+
+    def _telemetry(self, frame: RawFrame, now_ns: int) -> None:
+        message = telemetry.decode(frame)
+        if isinstance(message, Heartbeat):
+            self._heard(message, now_ns)
+        elif isinstance(message, Unusable):
+            self.counters.unusable_telemetry += 1
+        if self._vehicle is None or frame.system_id != self._vehicle.system_id:
+            return
+        try:
+            self._handler.on_telemetry(message, now_ns)
+        except Exception as error:  # noqa: BLE001  the frame is through; the next ones must get through too
+            self._handler_failed("on_telemetry", error)
+
+    def _heard(self, heartbeat: Heartbeat, now_ns: int) -> None:
+        if not is_autopilot(heartbeat):
+            return
+        self._autopilot_systems.add(heartbeat.system_id)
+        silent = now_ns - self._vehicle_heard_ns > _VEHICLE_SILENT_NS
+        if self._vehicle is None or silent or heartbeat.system_id == self._vehicle.system_id:
+            self._vehicle = heartbeat
+            self._vehicle_heard_ns = now_ns
+
+    def _handler_failed(self, call: str, error: Exception) -> None:
+        self.counters.handler_errors += 1
+        failure = f"{call}: {error!r}"
+        if failure != self._last_failure:  # once, not at the rate of the messages
+            self._last_failure = failure
+            _LOG.error("the proxy's handler failed in %s", call, exc_info=error)
+
+
+def _link_counts(link: LinkCounters) -> dict[str, int]:
+    return {
+        "garbage_bytes": link.framing.garbage_bytes,
+        "crc_errors": link.framing.crc_errors,
+        "send_drops": link.send_drops,
+    }

@@ -88,10 +88,10 @@ def test_the_images_move_as_the_poses_say() -> None:
     for first in range(10, 210, 25):
         (r1, p1), (r2, p2) = camera_pose(first), camera_pose(first + 1)
         a, b = tracks(image(first), image(first + 1))
-        assert len(a) > 60
+        assert len(a) > 25
         turn = r2.T @ r1
         move = r2.T @ (p1 - p2)
         right.append(epipolar_px(a, b, turn, move))
         wrong.append(epipolar_px(a, b, turn.T, move))
-    assert np.median(right) < 1.0
-    assert np.median(wrong) > 3 * np.median(right)
+    assert np.median(right) < 0.6
+    assert np.median(wrong) > 10 * np.median(right)

@@ -9,8 +9,9 @@ that only the message's definition tells (CRC_EXTRA). So two kinds of evidence a
   unknown frame, a signature) were taken for good too early, the verified frame that began in them still
   comes out.
 - A frame of an unknown message is accepted by its place: the walk behind it lands on the end of a datagram
-  or on another frame; or it stands directly behind a frame (or at the start of a datagram) and names a
-  sender that this peer's verified frames have named before.
+  or on another frame; or it stands directly behind a frame (or at the start of a datagram). In the second
+  case it must name a sender that this peer's verified frames have named before; in the first such a one
+  wins over one that does not.
 
 A candidate of a known message with a wrong checksum is given up one byte at a time, so that a stray 0xFD or
 0xFE costs itself alone.
@@ -149,6 +150,8 @@ class _Candidate(NamedTuple):
     """The walk behind it reaches a datagram's end or another frame's start."""
     hides_verified: bool
     """A verified frame starts inside it, where its own checksum does not cover (INCOMPLETE: anywhere)."""
+    hides_trusted: bool
+    """An unknown frame that lands and names a known sender starts inside it."""
     hides_landing: bool
     """An unknown frame that lands starts inside it."""
 
@@ -251,7 +254,7 @@ class Framer:
         Returns where to go on in the buffer of ``size`` bytes that ends with this datagram.
         """
         passed = self._passed + datagram
-        candidates = _survey(passed, 0, 0)
+        candidates = _survey(passed, 0, 0, self._senders)
         watched_from, watched_to = 0, self._passed_over
         for start, candidate in candidates.items():
             if start >= watched_to:
@@ -281,8 +284,8 @@ class Framer:
     def _weigh(self, buffer: bytes, position: int, boundary: int, frames: list[RawFrame]) -> None:
         """Append the frames from ``position`` on, where there is more than verified frames."""
         size = len(buffer)
-        candidates = _survey(buffer, position, boundary)
         senders = self._senders | {(f.system_id, f.component_id) for f in frames}
+        candidates = _survey(buffer, position, boundary, senders)
         # A datagram that walks to its own end outweighs a dangling start left by the one before.
         fresh = candidates.get(boundary) if boundary else None
         dangling_until = (
@@ -304,15 +307,18 @@ class Framer:
                 case _Kind.VERIFIED:
                     accepted = not candidate.hides_verified
                 case _Kind.UNKNOWN:
-                    accepted = not candidate.hides_verified and (
-                        candidate.lands
-                        or (anchored and not candidate.hides_landing and _sender(buffer, start) in senders)
+                    trusted = _sender(buffer, start) in senders
+                    accepted = (
+                        not candidate.hides_verified
+                        and (trusted or not candidate.hides_trusted)
+                        and (candidate.lands or (anchored and trusted and not candidate.hides_landing))
                     )
                 case _Kind.CORRUPT:
                     accepted = False
                     self.counters.crc_errors += candidate.lands and not candidate.hides_verified
                 case _Kind.INCOMPLETE:
-                    if not candidate.hides_verified and start >= dangling_until:
+                    hides = candidate.hides_verified or candidate.hides_trusted
+                    if not hides and start >= dangling_until:
                         self._held = buffer[start:]
                         break
                     accepted = False
@@ -340,14 +346,16 @@ class Framer:
             self._watch(buffer, candidates, uncovered_from, position)
 
 
-def _survey(buffer: bytes, position: int, boundary: int) -> dict[int, _Candidate]:
+def _survey(
+    buffer: bytes, position: int, boundary: int, senders: set[tuple[int, int]]
+) -> dict[int, _Candidate]:
     """Return all candidates from ``position`` on by their start, each judged once, in ascending order.
 
     Going backwards, what a candidate's walk lands on is already known: the cost is linear in the bytes.
     """
     size = len(buffer)
     candidates: dict[int, _Candidate] = {}
-    next_verified = next_landing = size
+    next_verified = next_trusted = next_landing = size
     starts = [match.start() for match in _MAGIC.finditer(buffer, position)]
     for start in reversed(starts):
         kind, end, message_id = _classify(buffer, start, size)
@@ -361,11 +369,15 @@ def _survey(buffer: bytes, position: int, boundary: int) -> dict[int, _Candidate
             # The checksum speaks for all but a signature: a frame cut short there would swallow the next one.
             is_signed = buffer[start] == MAGIC_V2 and buffer[start + 2] & INCOMPAT_SIGNED
             hides_verified = bool(is_signed) and next_verified >= end - SIGNATURE_BYTES
-        candidates[start] = _Candidate(kind, end, message_id, lands, hides_verified, next_landing < end)
+        candidates[start] = _Candidate(
+            kind, end, message_id, lands, hides_verified, next_trusted < end, next_landing < end
+        )
         if kind is _Kind.VERIFIED and not hides_verified:
             next_verified = start
         elif kind is _Kind.UNKNOWN and lands:
             next_landing = start
+            if _sender(buffer, start) in senders:
+                next_trusted = start
     return dict(reversed(candidates.items()))
 
 

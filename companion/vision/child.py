@@ -1,1 +1,243 @@
-"""The worker process."""
+"""The worker's pipeline: the detector's answers as reports. The only module that imports ``detector``.
+
+From a frame and the vehicle's pose to the paper's block L2I: the answered pixel as a ray in body FRD, its
+range in metres, and the free distance along level azimuths across the field of view.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.config import CameraConfig, DetectorConfig
+from companion.errors import ConfigError
+from companion.frames.source import Frame
+from companion.guidance.coordinates import r_body_from_camera, r_ned_from_body, wrap_rad
+from companion.guidance.observation import BearingRange, DetectionReport, Pose
+from detector.camera_model import CameraError, CameraModel
+from detector.observer import CameraPose, MetricRange, Observation, VoidObserver
+from detector.params import DetectorParams, ParamsError
+from detector.results import Direction, NoDetection, NoDetectionReason, SinglePlane
+
+Vector = NDArray[np.float64]
+
+BEARING_STEP_RAD = math.radians(3.0)
+_MAX_ASPECT_CHANGE = 0.02
+"""A frame whose sides relate otherwise than the calibrated image's by more than this is not a resized one."""
+_STEEP = math.sin(math.radians(10.0))
+"""An axis whose level part is below this points up or down and has no azimuth."""
+_AXIS = np.array([0.0, 0.0, 1.0])
+
+
+def build_pipeline(detector: DetectorConfig, camera: CameraConfig) -> VoidPipeline:
+    """Build the pipeline of a configuration.
+
+    Raises
+    ------
+    companion.errors.ConfigError
+        When the camera file or the parameters cannot be used.
+    """
+    cv2.setNumThreads(detector.threads)
+    try:
+        if detector.params_file:
+            params = DetectorParams.from_toml(Path(detector.params_file), detector.preset)
+        else:
+            params = DetectorParams.preset(detector.preset)
+    except ParamsError as error:
+        raise ConfigError(f"detector.params_file: {error}") from error
+    try:
+        calibrated = CameraModel.from_file(camera.file) if camera.file else None
+    except CameraError as error:
+        raise ConfigError(f"camera.file: {error}") from error
+    return VoidPipeline(params, camera, calibrated)
+
+
+class VoidPipeline:
+    """Runs the observer on each frame and puts its answers in the vehicle's terms.
+
+    Parameters
+    ----------
+    params
+        Of the detector.
+    camera
+        Mounting, and the field of view that holds where there is no calibration.
+    calibrated
+        The camera file's model, at the size that it was made for.
+    """
+
+    def __init__(self, params: DetectorParams, camera: CameraConfig, calibrated: CameraModel | None) -> None:
+        self._params = params
+        self._hfov_deg = camera.hfov_deg
+        self._calibrated = calibrated
+        self._r_body_from_camera = r_body_from_camera(
+            math.radians(camera.mount_roll_deg),
+            math.radians(camera.mount_pitch_deg),
+            math.radians(camera.mount_yaw_deg),
+        )
+        self._model: CameraModel | None = None
+        self._observer: VoidObserver | None = None
+
+    def detect(self, frame: Frame, pose: Pose | None) -> DetectionReport:
+        """Return the report on one frame. A frame of another size starts anew."""
+        began_s = time.perf_counter()
+        height_px, width_px = frame.image.shape
+        model, observer = self._model, self._observer
+        if model is None or observer is None or (model.width_px, model.height_px) != (width_px, height_px):
+            try:
+                model = self._model_for(width_px, height_px)
+            except CameraError as error:
+                return DetectionReport(
+                    frame.seq,
+                    frame.time_ns,
+                    "none",
+                    reason=NoDetectionReason.WRONG_SIZE.value,
+                    detail=str(error),
+                    pose=pose,
+                    detector_s=time.perf_counter() - began_s,
+                )
+            observer = VoidObserver(self._params, model)
+            self._model, self._observer = model, observer
+        r_ned_from_camera = (
+            None if pose is None else r_ned_from_body(pose.q_ned_from_body) @ self._r_body_from_camera
+        )
+        camera_pose = (
+            None
+            if pose is None or r_ned_from_camera is None
+            else CameraPose(r_ned_from_camera, np.array([pose.north_m, pose.east_m, pose.down_m]))
+        )
+        observation = observer.observe(frame.image, frame.time_ns, camera_pose)
+        return self._report(frame, pose, observation, model, r_ned_from_camera, began_s)
+
+    def _model_for(self, width_px: int, height_px: int) -> CameraModel:
+        if self._calibrated is None:
+            return CameraModel.from_hfov(width_px, height_px, self._hfov_deg)
+        was = self._calibrated
+        change = (width_px / height_px) / (was.width_px / was.height_px) - 1.0
+        if abs(change) > _MAX_ASPECT_CHANGE:
+            raise CameraError(
+                f"found a frame of {width_px} x {height_px} px, allowed the sides' ratio of the camera file, "
+                f"{was.width_px} x {was.height_px}"
+            )
+        return was.scaled_to(width_px, height_px)
+
+    def _report(
+        self,
+        frame: Frame,
+        pose: Pose | None,
+        observation: Observation,
+        model: CameraModel,
+        r_ned_from_camera: Vector | None,
+        began_s: float,
+    ) -> DetectionReport:
+        kind, reason, detail = "none", "", ""
+        point_px: tuple[float, float] | None = None
+        ray_body: tuple[float, float, float] | None = None
+        along: MetricRange | None = None
+        contact_frames: float | None = None
+        match observation.detection:
+            case Direction(x_px, y_px, direction_kind, contact):
+                kind, point_px = direction_kind.value, (float(x_px), float(y_px))
+                ray = model.pixel_to_ray([point_px])[0]
+                if np.isfinite(ray).all():
+                    ray_body = _as_floats(self._r_body_from_camera @ ray)
+                    along = observation.range_along(ray)
+                contact_frames = None if contact is None else float(contact.frames)
+            case SinglePlane(contact):
+                kind = "single_plane"
+                along = observation.range_along(_level_axis(r_ned_from_camera))
+                contact_frames = None if contact is None else float(contact.frames)
+            case NoDetection(no_reason, detail):
+                reason = no_reason.value
+        known = along if along is not None and _is_usable(along) else None
+        return DetectionReport(
+            frame.seq,
+            frame.time_ns,
+            kind,
+            reason=reason,
+            detail=detail,
+            x_px=None if point_px is None else point_px[0],
+            y_px=None if point_px is None else point_px[1],
+            ray_body=ray_body,
+            pose=pose,
+            baseline_m=_finite_or_none(observation.baseline_m),
+            time_to_contact_frames=_finite_or_none(contact_frames),
+            distance_m=None if known is None else float(known.distance_m),
+            distance_spread_m=None if known is None else float(known.spread_m),
+            bearings=() if r_ned_from_camera is None else _bearings(observation, model, r_ned_from_camera),
+            detector_s=time.perf_counter() - began_s,
+        )
+
+
+def level_rays(model: CameraModel, r_ned_from_camera: Vector) -> list[tuple[float, Vector]]:
+    """Return the level directions that the camera sees, every three degrees from its axis.
+
+    Parameters
+    ----------
+    model
+        The camera.
+    r_ned_from_camera
+        (3, 3), camera to local NED.
+
+    Returns
+    -------
+    Azimuth (rad in (-pi, pi], local NED) and unit vector in the camera frame of each; none where the camera
+    looks up or down, or past the horizon.
+    """
+    north, east, _ = r_ned_from_camera @ _AXIS
+    if math.hypot(north, east) < _STEEP:
+        return []
+    axis_rad = math.atan2(east, north)
+    # The diagonal: a rolled camera sees more of the horizon than its horizontal field of view.
+    reach = math.ceil(0.5 * math.hypot(model.hfov_rad, model.vfov_rad) / BEARING_STEP_RAD)
+    seen: list[tuple[float, Vector]] = []
+    for step in range(-reach, reach + 1):
+        azimuth_rad = wrap_rad(axis_rad + step * BEARING_STEP_RAD)
+        ray = r_ned_from_camera.T @ np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
+        x_px, y_px = model.ray_to_pixel([ray])[0]
+        # NaN (behind the camera, beyond the lens) fails both comparisons.
+        if 0 <= x_px <= model.width_px - 1 and 0 <= y_px <= model.height_px - 1:
+            seen.append((azimuth_rad, ray))
+    return seen
+
+
+def _bearings(
+    observation: Observation, model: CameraModel, r_ned_from_camera: Vector
+) -> tuple[BearingRange, ...]:
+    found: list[BearingRange] = []
+    for azimuth_rad, ray in level_rays(model, r_ned_from_camera):
+        along = observation.range_along(ray)
+        if along is not None and _is_usable(along):
+            found.append(
+                BearingRange(azimuth_rad, float(along.distance_m), float(along.spread_m), along.samples)
+            )
+    return tuple(found)
+
+
+def _level_axis(r_ned_from_camera: Vector | None) -> Vector:
+    """Return the camera's axis turned into the horizontal plane, in the camera frame; the axis itself without an attitude."""
+    if r_ned_from_camera is None:
+        return _AXIS
+    north, east, _ = r_ned_from_camera @ _AXIS
+    level = math.hypot(north, east)
+    if level < _STEEP:
+        return _AXIS
+    ray: Vector = r_ned_from_camera.T @ np.array([north / level, east / level, 0.0])
+    return ray
+
+
+def _is_usable(along: MetricRange) -> bool:
+    return math.isfinite(along.distance_m) and along.distance_m > 0 and math.isfinite(along.spread_m)
+
+
+def _finite_or_none(value: float | None) -> float | None:
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+def _as_floats(vector: Vector) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in vector)
+    return x, y, z

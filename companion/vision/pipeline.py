@@ -41,6 +41,10 @@ def load_factory(name: str) -> PipelineFactory:
     module_name, _, function_name = name.partition(":")
     try:
         factory = getattr(importlib.import_module(module_name), function_name)
-    except (ModuleNotFoundError, AttributeError, ValueError) as error:
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise  # it is there, and something that it needs is not: a broken installation
+        raise ConfigError(f"pipeline {name!r} cannot be found: {error}") from error
+    except (AttributeError, ValueError) as error:
         raise ConfigError(f"pipeline {name!r} cannot be found: {error}") from error
     return cast("PipelineFactory", factory)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -146,7 +147,7 @@ class VisionSupervisor:
         frame
             Its image is (H, W) uint8.
         pose
-            The vehicle at the frame's time, where it is known.
+            The vehicle at the frame's time, where it is known; one with a NaN in it is not.
         """
         image = frame.image
         if image.ndim != 2 or image.dtype != np.uint8 or not 0 < image.size <= _MAX_FRAME_BYTES:
@@ -167,7 +168,9 @@ class VisionSupervisor:
         slot = 0 if self._in_flight is None else 1 - self._in_flight.slot
         slots.write(slot, image)
         height_px, width_px = image.shape
-        self._waiting = Detect(self._offered, slot, height_px, width_px, frame.seq, frame.time_ns, pose)
+        self._waiting = Detect(
+            self._offered, slot, height_px, width_px, frame.seq, frame.time_ns, _finite_or_none(pose)
+        )
         self._dispatch()
 
     async def validate(self) -> None:
@@ -299,6 +302,13 @@ class VisionSupervisor:
         self._in_flight = frame
         self._state = "busy"
         life.arm(self._detector.deadline_s, f"no answer within {self._detector.deadline_s} s")
+
+
+def _finite_or_none(pose: Pose | None) -> Pose | None:
+    if pose is None:
+        return None
+    numbers = (pose.north_m, pose.east_m, pose.down_m, *pose.q_ned_from_body)
+    return pose if all(map(math.isfinite, numbers)) else None
 
 
 @dataclass(frozen=True, slots=True)

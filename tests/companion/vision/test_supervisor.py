@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
+import dataclasses
 import io
 import json
+import math
 import os
 import signal
 import subprocess
@@ -146,6 +148,15 @@ async def test_strided_images_are_copied_as_they_look():
         wide = np.arange(48 * 128, dtype=np.int64).reshape(48, 128).astype(np.uint8) % 100
         report = await bench.report_on(wide[::2, ::2])
         assert report.x_px == float(wide[::2, ::2].mean())
+
+
+async def test_a_pose_that_is_not_finite_is_no_pose():
+    async with running() as bench:
+        await bench.ready()
+        for broken in ({"north_m": math.nan}, {"q_ned_from_body": (1.0, math.inf, 0.0, 0.0)}):
+            report = await bench.report_on(grey(1), dataclasses.replace(POSE, **broken))
+            assert report.pose is None
+        assert bench.status.restarts == 0
 
 
 async def test_the_newest_frame_wins_while_the_worker_is_busy():
@@ -403,6 +414,8 @@ async def test_validation_tells_a_bad_configuration_from_a_fault():
         await validated(f"{STUBS}:unusable")
     with pytest.raises(ConfigError, match="cannot be found"):
         await validated("no.such.module:thing")
+    with pytest.raises(WorkerError, match="No module named 'not_installed'"):
+        await validated("tests.companion.vision.stub_pipeline_without_its_library:echo")
     with pytest.raises(WorkerError, match="ZeroDivisionError: a fault of the program"):
         await validated(f"{STUBS}:broken")
     with pytest.raises(WorkerError, match=r"not up within 0\.2 s"):

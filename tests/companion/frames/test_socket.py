@@ -1,6 +1,7 @@
 import asyncio
 import contextlib
 import io
+import itertools
 import json
 import struct
 import threading
@@ -108,28 +109,28 @@ async def test_the_newest_frame_wins(events):
 
 
 async def test_it_connects_again_when_the_sender_goes_and_when_it_sends_garbage(events):
-    talks = iter(
-        [
-            [now_frame(0)],  # closes after one
-            [b"GET / HTTP/1.1\r\nHost: somewhere\r\n\r\n"],
-            [now_frame(0)[:40]],  # closes within a frame
-            [HEADER.pack(b"VCF1", 9000, 9000, 0, 0, 0, 81_000_000)],
-            [HEADER.pack(b"VCF1", 64, 48, 0, 0, 0, 7)],
-            [HEADER.pack(b"VCF1", 0, 0, 0, 0, 0, 0)],
-        ]
-    )
+    after_a_good_frame = [
+        b"",  # closes
+        b"GET / HTTP/1.1\r\nHost: somewhere\r\n\r\n",
+        now_frame(0)[:40],  # closes within a frame
+        HEADER.pack(b"VCF1", 9000, 9000, 0, 0, 0, 81_000_000),
+        HEADER.pack(b"VCF1", 64, 48, 0, 0, 0, 7),
+        HEADER.pack(b"VCF1", 0, 0, 0, 0, 0, 0),
+    ]
+    connections = itertools.count()
 
     async def talk(reader, writer):
-        pieces = next(talks, None)
-        for piece in pieces or [now_frame(99)]:
-            writer.write(piece)
-        await writer.drain()
-        if pieces is None:
+        number = next(connections)
+        writer.write(now_frame(number))
+        if number >= len(after_a_good_frame):
             await reader.read()
+            return
+        writer.write(after_a_good_frame[number])
+        await writer.drain()
 
     async with sender(talk) as port:
-        frames, counts = await first_frames(port, events[0], 2)
-    assert [frame.seq for frame in frames] == [0, 99]
+        frames, counts = await first_frames(port, events[0], 7)
+    assert [frame.seq for frame in frames] == list(range(7))
     assert counts.reconnects == 6
     await asyncio.sleep(0.1)
     reasons = [record["reason"] for record in events[1]() if record["event"] == "frame_stream_lost"]

@@ -121,10 +121,12 @@ class FakeAutopilot:
         self._delayed.clear()
         if self._task is not None:
             self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+            await asyncio.wait({self._task})
         if self._transport is not None:
             self._transport.close()
             await asyncio.sleep(0)  # lets the loop close the socket
+        if self._task is not None and not self._task.cancelled():
+            self._task.result()  # it never ends by itself: this raises what stopped it
 
     # ---- what it is doing ----
 

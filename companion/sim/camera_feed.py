@@ -56,6 +56,32 @@ class CameraMount:
     yaw_rad: float = 0.0
 
 
+def render_at(
+    scene: Renderer, camera: CameraModel, pose: Pose, mount: CameraMount | None = None
+) -> NDArray[np.uint8]:
+    """Return what the camera of a vehicle sees.
+
+    Parameters
+    ----------
+    scene
+        The world.
+    camera
+        Size and lens.
+    pose
+        Of the vehicle's body.
+    mount
+        How the camera sits on it; by default it looks forward.
+
+    Returns
+    -------
+    (height, width) uint8, grey.
+    """
+    mount = mount if mount is not None else CameraMount()
+    body_from_camera = r_body_from_camera(mount.roll_rad, mount.pitch_rad, mount.yaw_rad)
+    position = (pose.north_m, pose.east_m, pose.down_m)
+    return scene.render(camera, position, r_ned_from_body(pose.q_ned_from_body) @ body_from_camera)
+
+
 class CameraFeed:
     """Renders what a vehicle sees and serves it as frames; ``async with`` is its lifetime.
 
@@ -144,8 +170,10 @@ class CameraFeed:
     ) -> None:
         if self._task is not None:
             self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+            await asyncio.wait({self._task})
         await self._stop()
+        if self._task is not None and not self._task.cancelled():
+            self._task.result()  # raises what went wrong, for example in ``pose``
 
     @property
     def address(self) -> Address:
@@ -226,11 +254,10 @@ async def _serve(
         async with FrameServer(listen) as server:
             host, port = server.address
             await loop.sock_sendall(poses, _READY + f"{host}:{port}".encode())
-            body_from_camera = r_body_from_camera(mount.roll_rad, mount.pitch_rad, mount.yaw_rad)
             while message := await _newest(poses):
-                time_ns, north, east, down, *q = _POSE.unpack(message)
-                r_ned_from_camera = r_ned_from_body((q[0], q[1], q[2], q[3])) @ body_from_camera
-                image = await asyncio.to_thread(scene.render, camera, (north, east, down), r_ned_from_camera)
+                time_ns, north_m, east_m, down_m, *q = _POSE.unpack(message)
+                pose = Pose(time_ns, north_m, east_m, down_m, (q[0], q[1], q[2], q[3]))
+                image = await asyncio.to_thread(render_at, scene, camera, pose, mount)
                 server.publish(image, time_ns)
     except LinkError as error:
         await loop.sock_sendall(poses, _FAILED + str(error).encode()[: _LONGEST_MESSAGE - len(_FAILED)])

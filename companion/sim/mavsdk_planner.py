@@ -15,6 +15,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -260,7 +261,11 @@ def parse_waypoints(text: str) -> list[Waypoint]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fly from the command line; 0 when all waypoints were reached."""
+    """Fly from the command line; 0 when all waypoints were reached.
+
+    Standard output carries the result alone: from here on, everything else that is written there goes to
+    standard error.
+    """
     parser = argparse.ArgumentParser(prog="python -m companion.sim.mavsdk_planner", description=__doc__)
     parser.add_argument("--url", required=True, help="mavsdk connection, for example udpin://127.0.0.1:14540")
     parser.add_argument("--waypoints", required=True, help='"n,e,d n,e,d,yaw_deg": m, local NED, and degrees')
@@ -274,6 +279,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         waypoints = parse_waypoints(options.waypoints)
     except ValueError as error:
         parser.error(str(error))
+    # mavsdk's native library logs to standard output: that is kept for the result.
+    sys.stdout.flush()
+    result_fd = os.dup(1)
+    os.dup2(2, 1)
     try:
         mission = asyncio.run(
             fly_with_mavsdk(
@@ -289,7 +298,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except CompanionError as error:
         sys.stderr.write(f"error: {error}\n")
         return 1
-    sys.stdout.write(json.dumps(dataclasses.asdict(mission)) + "\n")
+    with os.fdopen(result_fd, "w") as result:
+        result.write(json.dumps(dataclasses.asdict(mission)) + "\n")
     return 0 if mission.ended == "complete" else 1
 
 

@@ -176,10 +176,13 @@ class Planner:
     ) -> None:
         for task in self._tasks:
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.wait(self._tasks)
         if self._transport is not None:
             self._transport.close()
             await asyncio.sleep(0)  # lets the loop close the socket
+        for task in self._tasks:
+            if not task.cancelled():
+                task.result()  # it never ends by itself: this raises what stopped it
 
     @property
     def address(self) -> Address:

@@ -94,8 +94,8 @@ class RecordedPoses:
 
     def pose_at(self, elapsed_s: float) -> tuple[Vector3, Quaternion]:
         """Return position and attitude at a time after the first pose; clamped to the first and last pose."""
-        time_s = float(np.clip(self.times_s[0] + elapsed_s, self.times_s[0], self.times_s[-1]))
-        after = int(np.clip(np.searchsorted(self.times_s, time_s, side="right"), 1, len(self.times_s) - 1))
+        time_s = float(self.times_s[0]) + min(max(elapsed_s, 0.0), self.duration_s)
+        after = min(int(np.searchsorted(self.times_s, time_s, side="right")), len(self.times_s) - 1)
         before = after - 1
         share = (time_s - self.times_s[before]) / (self.times_s[after] - self.times_s[before])
         north, east, down = (1 - share) * self.positions_ned_m[before] + share * self.positions_ned_m[after]

@@ -125,6 +125,17 @@ async def test_recorded_poses_are_reported_from_their_start_time() -> None:
         assert len(autopilot.setpoints) > 5
 
 
+async def test_after_a_jump_the_camera_still_sees_from_the_true_place() -> None:
+    async with FakeAutopilot(vehicle=hovering(), armed=True) as autopilot:
+        before_ns = time.monotonic_ns()
+        autopilot.jump_estimate((0.0, 3.0, 0.0))
+        await until(lambda: autopilot.true_pose().time_ns > before_ns)
+        pose = autopilot.true_pose()
+        assert pose.time_ns <= time.monotonic_ns()
+        assert (pose.north_m, pose.east_m, pose.down_m) == pytest.approx((0.0, 0.0, -1.5), abs=0.01)
+        assert autopilot.position_ned_m == pytest.approx((0.0, 3.0, -1.5), abs=0.01)
+
+
 def test_only_a_replaying_autopilot_can_start_a_replay() -> None:
     with pytest.raises(ValueError, match="without recorded poses"):
         FakeAutopilot().start_replay(0)

@@ -142,6 +142,15 @@ async def test_a_camera_process_shows_the_scene_from_the_poses() -> None:
         assert np.abs(image.astype(int) - expected.astype(int)).mean() < 1.0
 
 
+async def test_what_goes_wrong_in_the_pose_comes_out() -> None:
+    def pose() -> Pose:
+        raise RuntimeError("no vehicle")
+
+    with pytest.raises(RuntimeError, match="no vehicle"):
+        async with CameraFeed(empty_room, CAMERA, pose):
+            await asyncio.sleep(0.1)
+
+
 class _Broken:
     def render(
         self, camera: CameraModel, position_ned_m: ArrayLike, r_ned_from_camera: ArrayLike, /

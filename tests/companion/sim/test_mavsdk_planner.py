@@ -45,7 +45,7 @@ async def test_an_unmodified_mavsdk_client_arms_flies_arrives_and_stops() -> Non
             "0.3",
         )
         assert code == 0, err
-        mission = json.loads(out.splitlines()[-1])
+        mission = json.loads(out)
         assert mission["ended"] == "complete"
         assert mission["arrived"] == [True, True]
         assert mission["system_id"] == 1
@@ -69,7 +69,7 @@ async def test_without_an_autopilot_it_ends_with_a_clear_error() -> None:
     assert code == 1
     assert "found no autopilot" in err
     assert "Traceback" not in err
-    assert "{" not in out
+    assert out == ""
 
 
 def test_waypoints_are_read_from_text() -> None:

@@ -62,9 +62,9 @@ class CameraModel:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, value in (("width_px", self.width_px), ("height_px", self.height_px)):
-            if not _MIN_SIDE_PX <= value <= _MAX_SIDE_PX:
-                raise CameraError(f"{name}: found {value}, allowed {_MIN_SIDE_PX} to {_MAX_SIDE_PX}")
+        for name, side in (("width_px", self.width_px), ("height_px", self.height_px)):
+            if not _MIN_SIDE_PX <= side <= _MAX_SIDE_PX:
+                raise CameraError(f"{name}: found {side}, allowed {_MIN_SIDE_PX} to {_MAX_SIDE_PX}")
         for name, value, side in (
             ("fx_px", self.fx_px, self.width_px),
             ("fy_px", self.fy_px, self.height_px),

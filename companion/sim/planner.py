@@ -112,6 +112,8 @@ class Planner:
         The planner's own identity.
     target_system, target_component
         The autopilot.
+    keep_frames
+        Keep the bytes of every frame sent and received, in ``sent_frames`` and ``received_frames``.
     clock
         Where time comes from.
 
@@ -131,6 +133,7 @@ class Planner:
         component_id: int = mavlink.MAV_COMP_ID_MISSIONPLANNER,
         target_system: int = 1,
         target_component: int = 1,
+        keep_frames: bool = False,
         clock: Clock | None = None,
     ) -> None:
         if not (math.isfinite(rate_hz) and 0.0 < rate_hz <= 200.0):
@@ -149,7 +152,10 @@ class Planner:
         self._start_ns = self._clock.now_ns()
         self._acks: dict[int, int] = {}
         self._offboard_asked = False
+        self._keep_frames = keep_frames
         self.sent: list[SentSetpoint] = []
+        self.sent_frames: list[bytes] = []
+        self.received_frames: list[bytes] = []
         self.status_texts: list[str] = []
         self.modes: list[FlightMode] = []
         self.armed = False
@@ -346,6 +352,8 @@ class Planner:
         """Take one datagram from the socket."""
         for frame in self._reader.read(datagram):
             self.frames_received += 1
+            if self._keep_frames:
+                self.received_frames.append(frame.raw)
             if self._remote is None:
                 self._remote = sender
             if frame.message is not None and frame.system_id == self._target_system:
@@ -421,6 +429,8 @@ class Planner:
     def _send(self, datagram: bytes) -> None:
         if self._transport is not None and self._remote is not None and not self._transport.is_closing():
             self._transport.sendto(datagram, self._remote)
+            if self._keep_frames:
+                self.sent_frames.append(datagram)
 
     async def _until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait for a condition that arriving messages change; return whether it holds."""

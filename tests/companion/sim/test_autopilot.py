@@ -75,6 +75,24 @@ async def test_a_planner_without_autopilot_says_so() -> None:
             await planner.wait_ready(0.2)
 
 
+async def test_both_ends_can_keep_every_frame_for_comparison() -> None:
+    async with (
+        FakeAutopilot(keep_frames=True) as autopilot,
+        Planner(autopilot.address, keep_frames=True) as planner,
+    ):
+        await planner.wait_ready()
+        await planner.arm()
+        planner.aim(Waypoint(0.0, 0.0, -1.0))
+        await until(lambda: len(planner.received_frames) > 100)
+        sent = list(autopilot.sent_frames)
+        await until(lambda: len(planner.received_frames) >= len(sent))
+        assert planner.received_frames[: len(sent)] == sent
+        sent = list(planner.sent_frames)
+        await until(lambda: len(autopilot.received_frames) >= len(sent))
+        assert autopilot.received_frames[: len(sent)] == sent
+        assert [s.raw for s in planner.sent] == [f for f in planner.sent_frames if f[7:10] == b"\x54\0\0"]
+
+
 async def test_a_refused_command_is_an_error_with_its_number() -> None:
     async with FakeAutopilot(vehicle=hovering()) as autopilot, Planner(autopilot.address) as planner:
         await planner.wait_ready()

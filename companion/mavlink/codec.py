@@ -208,7 +208,7 @@ def _reassemble(frame: RawFrame, payload: bytearray) -> bytes:
     if frame.data[0] == MAGIC_V1:
         header, body = frame.data[:HEADER_V1], bytes(payload)
     else:
-        body = bytes(payload).rstrip(b"\0") or b"\0"  # at least one byte stays
+        body = bytes(payload).rstrip(b"\0")  # never empty: what is changed here has a type_mask
         header = frame.data[:1] + bytes([len(body)]) + frame.data[2:HEADER_V2]
     data = header + body
     return data + checksum(data[1:], frame.message_id).to_bytes(CHECKSUM_BYTES, "little")

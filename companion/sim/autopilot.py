@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections import Counter
 from collections.abc import Mapping
 from types import TracebackType
@@ -20,6 +21,7 @@ from companion.sim.px4_modes import FlightMode
 from companion.sim.recorded_poses import RecordedPoses
 from companion.sim.telemetry import LandedState
 from companion.sim.vehicle import Vector3, Vehicle, VehicleState
+from companion.sim.wire import RECEIVE_BUFFER_BYTES
 
 _TICK_NS = 5_000_000
 _MOST_PEERS = 8
@@ -110,6 +112,9 @@ class FakeAutopilot:
         except OSError as error:
             host, port = self._local
             raise LinkError(f"the fake autopilot cannot listen on udp {host}:{port}: {error}") from error
+        self._transport.get_extra_info("socket").setsockopt(
+            socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES
+        )
         self._task = loop.create_task(self._run(), name="fake autopilot")
         return self
 
@@ -250,9 +255,12 @@ class FakeAutopilot:
         due_ns = self._clock.now_ns()
         while True:
             now_ns = self._clock.now_ns()
-            frames = self._endpoint.advance(now_ns)
-            for peer in self._peers:
-                self._send(frames, peer)
+            if self._peers:
+                frames = self._endpoint.advance(now_ns)
+                for peer in self._peers:
+                    self._send(frames, peer)
+            else:
+                self._controller.advance(now_ns)  # it flies whether anybody listens or not
             due_ns = max(due_ns + _TICK_NS, now_ns)
             await self._clock.sleep_until_ns(due_ns)
 

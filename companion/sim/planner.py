@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -18,7 +19,7 @@ from companion.clock import Clock, RealClock
 from companion.errors import CompanionError, LinkError
 from companion.sim.px4_modes import FlightMode, mode_from_custom
 from companion.sim.vehicle import Vector3
-from companion.sim.wire import FrameReader, FrameWriter, ReceivedFrame
+from companion.sim.wire import RECEIVE_BUFFER_BYTES, FrameReader, FrameWriter, ReceivedFrame
 
 Address = tuple[str, int]
 
@@ -171,6 +172,9 @@ class Planner:
         except OSError as error:
             host, port = self._local
             raise LinkError(f"the planner cannot listen on udp {host}:{port}: {error}") from error
+        self._transport.get_extra_info("socket").setsockopt(
+            socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES
+        )
         self._tasks = [
             loop.create_task(self._send_heartbeats(), name="planner heartbeats"),
             loop.create_task(self._send_setpoints(), name="planner setpoints"),

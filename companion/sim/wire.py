@@ -15,6 +15,9 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guidance.setpoint import LocalSetpoint
 
+RECEIVE_BUFFER_BYTES = 4 << 20
+"""What the simulated parties ask for, so that none of a burst is lost on loopback; the system may give less."""
+
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _DECODING_ERRORS = (mavlink.MAVError, struct.error, ValueError, TypeError, LookupError)

@@ -286,13 +286,6 @@ class Framer:
         size = len(buffer)
         senders = self._senders | {(f.system_id, f.component_id) for f in frames}
         candidates = _survey(buffer, position, boundary, senders)
-        # A datagram that walks to its own end outweighs a dangling start left by the one before.
-        fresh = candidates.get(boundary) if boundary else None
-        dangling_until = (
-            boundary
-            if fresh is not None and fresh.kind is _Kind.UNKNOWN and _walks_to(candidates, boundary, size)
-            else 0
-        )
         uncovered_from = position
         anchored = True  # the position is where a frame begins if all is well
         for start, candidate in candidates.items():
@@ -317,8 +310,7 @@ class Framer:
                     accepted = False
                     self.counters.crc_errors += candidate.lands and not candidate.hides_verified
                 case _Kind.INCOMPLETE:
-                    hides = candidate.hides_verified or candidate.hides_trusted
-                    if not hides and start >= dangling_until:
+                    if not (candidate.hides_verified or candidate.hides_trusted):
                         self._held = buffer[start:]
                         break
                     accepted = False
@@ -379,13 +371,3 @@ def _survey(
             if _sender(buffer, start) in senders:
                 next_trusted = start
     return dict(reversed(candidates.items()))
-
-
-def _walks_to(candidates: dict[int, _Candidate], start: int, goal: int) -> bool:
-    """Return whether the walk from ``start`` over complete frames ends exactly at ``goal``."""
-    while start < goal:
-        candidate = candidates.get(start)
-        if candidate is None or candidate.kind in (_Kind.INCOMPLETE, _Kind.CORRUPT):
-            return False
-        start = candidate.end
-    return start == goal

@@ -149,13 +149,22 @@ def test_stray_markers_cost_no_good_frame_of_a_long_stream(seed):
     assert _is_subsequence(sent, got)
 
 
-def test_a_dangling_start_does_not_hold_up_clean_datagrams_of_unknown_messages():
+def test_a_dangling_start_does_not_hold_up_unknown_messages_of_a_known_sender():
     framer = Framer()
+    framer.feed(_known(0, bytes(9), 0, "v2"))
     assert framer.feed(b"\xfd\xff\x00") == []
     for seq in range(5):
         frame = _unknown(436, b"\x01\x02\x03", seq, "v2")
         assert [f.data for f in framer.feed(frame)] == [frame]
     assert framer.counters.garbage_bytes == 3
+
+
+def test_a_dangling_start_delays_unknown_messages_of_an_unknown_sender_but_loses_none():
+    framer = Framer()
+    framer.feed(b"\xfd\xff\x00")
+    frames = [_unknown(436, b"\x01\x02\x03", seq, "v2") for seq in range(40)]
+    got = [f.data for frame in frames for f in framer.feed(frame)]
+    assert got == frames
 
 
 def test_a_frame_split_over_datagrams_is_joined():

@@ -125,8 +125,8 @@ def test_straight_edges_run_to_the_vanishing_point() -> None:
         abs((x2 - x1) * (y1 - CAMERA.cy_px) - (x1 - CAMERA.cx_px) * (y2 - y1)) / math.hypot(x2 - x1, y2 - y1)
         for x1, y1, x2, y2 in slanted
     ]
-    assert len(miss_px) >= 4
-    assert np.median(miss_px) < 3.0
+    # Bricks and patches give lines of their own; a chance line comes this near to the point in one case of fifty.
+    assert np.sum(np.array(miss_px) < 2.0) >= 4
 
 
 def test_a_nearer_surface_hides_a_farther_one_and_nothing_behind_is_seen() -> None:

@@ -1,0 +1,494 @@
+"""What the expansion of the image says: focus of expansion, time to contact, metric ranges.
+
+Tracks are pairs of (N, 2) arrays, ``start_px`` in the earlier frame and ``end_px`` in the later one, with the rotation already
+removed: the starts are where the points would have been seen from the earlier place with the *later* camera's orientation.
+Then all flow comes from the translation, and it lies on lines through one point, the focus of expansion. That is not the
+vanishing point (from lines in the scene) and not the void (what the detector chooses).
+
+All results refer to the instant of the later frame. Points must be those of an image without distortion
+(:func:`ideal_px`), except where a function takes the camera itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from detector.camera_model import CameraModel
+from detector.results import TimeToContact
+
+FLOW_SIGMA_PX: Final = 0.3
+"""Standard deviation of one track's flow on each axis, as measured for Lucas-Kanade on sharp frames."""
+
+_MIN_TRACKS: Final = 12
+_HYPOTHESES: Final = 256
+_MIN_INLIER_SHARE: Final = 0.5
+_MAX_FOCUS_SIGMA: Final = 0.06  # of the tracks' extent: beyond it the focus is a guess
+_REFINEMENTS: Final = 12
+
+_MIN_CONTACT_SAMPLES: Final = 5
+_RESOLVED_INVERSE_CONTACT: Final = 0.06  # a sample must tell one step in 16 from none
+_CONTACT_QUANTILE: Final = 0.75  # of the inverse: the low side of the time
+
+_RESOLVED_SHARE: Final = 0.35  # of the range: a sample less sure than this has no place, only a lower bound
+_KNOWN_HALF_ANGLE_RAD: Final = math.radians(4.0)
+_KNOWN_SAMPLES: Final = 3
+_HIT_SAMPLES: Final = 3
+_HIT_SHARE: Final = 0.10
+
+
+@dataclass(frozen=True, slots=True)
+class MetricRange:
+    """Free distance along a direction, from the later camera.
+
+    Attributes
+    ----------
+    distance_m
+        To the nearest surface that the vehicle, moved along the direction, would meet; or, where it would meet none,
+        as far as the samples vouch for.
+    spread_m
+        Standard deviation of the samples behind it.
+    samples
+        Their number.
+    """
+
+    distance_m: float
+    spread_m: float
+    samples: int
+
+
+def ideal_px(camera: CameraModel, points_px: ArrayLike) -> NDArray[np.float64]:
+    """Return where points would lie in the image of the same camera without its distortion, (N, 2)."""
+    points = np.asarray(points_px, dtype=np.float64)
+    if not camera.is_distorted:
+        return points
+    rays = camera.pixel_to_ray(points)
+    ideal: NDArray[np.float64] = rays[:, :2] / rays[:, 2:3] * (camera.fx_px, camera.fy_px) + (
+        camera.cx_px,
+        camera.cy_px,
+    )
+    return ideal
+
+
+def focus_of_expansion_from_translation(
+    camera: CameraModel, translation_later: ArrayLike
+) -> NDArray[np.float64] | None:
+    """Return the focus of expansion of a known motion.
+
+    Parameters
+    ----------
+    camera
+        Its distortion is left out: the point belongs to the ideal image.
+    translation_later
+        (3,) from the earlier to the later camera position, in the later camera's axes; only its direction matters.
+
+    Returns
+    -------
+    (2,) px, perhaps outside the image; None when the motion is sideways (there is none) or zero. When the camera moves backwards it is
+    the point that the flow runs into.
+    """
+    translation = _vector(translation_later)
+    length = float(np.linalg.norm(translation))
+    if not math.isfinite(length) or abs(translation[2]) <= 0.02 * length:
+        return None
+    return np.array(
+        [
+            camera.cx_px + camera.fx_px * translation[0] / translation[2],
+            camera.cy_px + camera.fy_px * translation[1] / translation[2],
+        ]
+    )
+
+
+def fit_focus_of_expansion(
+    start_px: ArrayLike, end_px: ArrayLike, *, flow_sigma_px: float = FLOW_SIGMA_PX, seed: int = 0
+) -> NDArray[np.float64] | None:
+    """Estimate the focus of expansion from the tracks alone.
+
+    The cost of a track is the part of its flow across the line from the focus, in px, so that short flow says little, as it should. Random
+    pairs of lines give the start, iteratively reweighted least squares (Cauchy weights) the answer.
+
+    Parameters
+    ----------
+    start_px, end_px
+        (N, 2) each.
+    flow_sigma_px
+        Noise of the flow.
+    seed
+        Of the random pairs.
+
+    Returns
+    -------
+    (2,) px, perhaps outside the image; None when the tracks do not determine it: too few, no flow, flow that does not
+    run through one point (a rotation was not removed), sideways motion, or contraction.
+    """
+    start, end = _tracks(start_px, end_px)
+    flow = end - start
+    sigma = math.sqrt(2.0) * flow_sigma_px  # across the flow, both ends are noisy
+    moving = np.linalg.norm(flow, axis=1) > 2.0 * sigma
+    if int(moving.sum()) < _MIN_TRACKS:
+        return None
+    start, end, flow = start[moving], end[moving], flow[moving]
+    middle = 0.5 * (start + end)
+
+    focus = _best_hypothesis(middle, flow, sigma, seed)
+    if focus is None:
+        return None
+    normal_matrix = np.eye(2)
+    for _ in range(_REFINEMENTS):
+        residual, jacobian = _across(middle, flow, focus)
+        weight = 1.0 / (1.0 + (residual / (2.0 * sigma)) ** 2)
+        normal_matrix = jacobian.T @ (jacobian * weight[:, None])
+        if np.linalg.cond(normal_matrix) > 1e8:
+            return None
+        step = np.linalg.solve(normal_matrix, jacobian.T @ (weight * residual))
+        focus = focus - step
+        if float(np.linalg.norm(step)) < 1e-3:
+            break
+    residual, _ = _across(middle, flow, focus)
+    inliers = np.abs(residual) < 3.0 * sigma
+    outward = np.einsum("ij,ij->i", flow, middle - focus)[inliers] > 0.0
+    if inliers.mean() < _MIN_INLIER_SHARE or outward.size < _MIN_TRACKS or outward.mean() < 0.8:
+        return None
+    extent_px = float(np.linalg.norm(np.ptp(middle, axis=0)))
+    scatter = max(sigma, 1.4826 * float(np.median(np.abs(residual[inliers]))))
+    sigma_focus_px = scatter / math.sqrt(float(np.linalg.eigvalsh(normal_matrix)[0]))
+    if not np.isfinite(focus).all() or sigma_focus_px > _MAX_FOCUS_SIGMA * extent_px:
+        return None
+    return np.asarray(focus, dtype=np.float64)
+
+
+def time_to_contact_along(
+    start_px: ArrayLike,
+    end_px: ArrayLike,
+    focus_px: ArrayLike,
+    towards_px: ArrayLike,
+    gate_px: float,
+    *,
+    flow_sigma_px: float = FLOW_SIGMA_PX,
+) -> TimeToContact | None:
+    """Return the time to contact of what is seen about a direction: r / |flow| about the focus of expansion.
+
+    With depths Z in the later and Z + T in the earlier frame, a point's distance from the focus grows from r to r (Z + T) / Z, so
+    r / flow = Z / T with the r of the *start*: steps of the pair's length that are left at the instant of the later frame.
+
+    Parameters
+    ----------
+    start_px, end_px
+        (N, 2) each.
+    focus_px
+        (2,) focus of expansion.
+    towards_px
+        (2,) the direction.
+    gate_px
+        Tracks that end within this distance of it are used.
+    flow_sigma_px
+        Noise of the flow. Tracks so near to the focus that it would drown their flow are left out; by their place and
+        not by their flow, since otherwise far things would be left out and near ones not.
+
+    Returns
+    -------
+    The low side (first quartile of the times) of what lies there, never more than the noise lets one tell; None with fewer than five usable tracks.
+    """
+    start, end = _tracks(start_px, end_px)
+    focus, towards = np.asarray(focus_px, dtype=np.float64), np.asarray(towards_px, dtype=np.float64)
+    sigma = math.sqrt(2.0) * flow_sigma_px
+    offset = start - focus
+    radius = np.linalg.norm(offset, axis=1)
+    near_direction = np.linalg.norm(end - towards, axis=1) <= gate_px
+    usable = near_direction & (radius > sigma / _RESOLVED_INVERSE_CONTACT)
+    if int(usable.sum()) < _MIN_CONTACT_SAMPLES:
+        return None
+    offset, radius, flow = offset[usable], radius[usable], (end - start)[usable]
+    outward = offset / radius[:, None]
+    radial = np.einsum("ij,ij->i", flow, outward)
+    across = np.abs(flow[:, 0] * outward[:, 1] - flow[:, 1] * outward[:, 0])
+    consistent = (across < 3.0 * sigma + 0.35 * np.abs(radial)) & (radial > -3.0 * sigma)
+    # Where most of the flow does not run from the focus, the focus is wrong, and so would the time be.
+    if int(consistent.sum()) < max(_MIN_CONTACT_SAMPLES, 0.5 * consistent.size):
+        return None
+    inverse = radial[consistent] / radius[consistent]
+    inverse_sigma = sigma / radius[consistent]
+    quantile = _weighted_quantile(inverse, 1.0 / inverse_sigma**2, _CONTACT_QUANTILE)
+    floor = float(np.median(inverse_sigma))
+    value = max(quantile, floor)
+    scatter = 1.4826 * float(np.median(np.abs(inverse - np.median(inverse))))
+    frames = 1.0 / value
+    return TimeToContact(
+        frames=frames,
+        spread_frames=frames * frames * max(scatter, floor / math.sqrt(inverse.size)),
+        samples=int(inverse.size),
+    )
+
+
+def refine_rotation(
+    camera: CameraModel,
+    start_px: ArrayLike,
+    end_px: ArrayLike,
+    translation_later: ArrayLike,
+    *,
+    prior_sigma_rad: float,
+    flow_sigma_px: float = FLOW_SIGMA_PX,
+) -> NDArray[np.float64]:
+    """Estimate the small rotation that is still in the tracks, from how they miss their epipolar lines.
+
+    An attitude that is wrong by 0.1 degrees moves points as far as the parallax of something far away does. With the direction of motion
+    known, the part of the flow across the epipolar lines comes from that error alone: three unknowns, one equation a track, solved by
+    reweighted least squares about the prior "no error".
+
+    Parameters
+    ----------
+    camera, start_px, end_px
+        The tracks, as seen by the camera (distortion and all).
+    translation_later
+        (3,) from the earlier to the later position, in the later camera's axes.
+    prior_sigma_rad
+        How far the attitude may be wrong, one standard deviation.
+    flow_sigma_px
+        Noise of the flow.
+
+    Returns
+    -------
+    (3, 3) rotation to apply to the start rays.
+    """
+    a, b = camera.pixel_to_ray(start_px), camera.pixel_to_ray(end_px)
+    translation = _vector(translation_later)
+    sigma = math.sqrt(2.0) * flow_sigma_px / camera.fx_px
+    rotation = np.eye(3)
+    for _ in range(8):
+        turned = a @ rotation.T
+        plane = np.cross(translation, turned)
+        length = np.linalg.norm(plane, axis=1)
+        good = length > 0.03 * float(
+            np.linalg.norm(translation)
+        )  # nearly on the focus, the line's direction is noise
+        good &= np.isfinite(b).all(axis=1)
+        if int(good.sum()) < _MIN_TRACKS:
+            return np.eye(3)
+        plane, turned_good, end = plane[good] / length[good, None], turned[good], b[good]
+        residual = np.einsum("ij,ij->i", end, plane)
+        # Turning the start by w moves it by w x a; seen across the line that is w . (a x plane), and the end should follow it.
+        jacobian = -np.cross(turned_good, plane)
+        weight = 1.0 / (1.0 + (residual / (2.0 * sigma)) ** 2) / sigma**2
+        already = _rotation_vector(rotation)
+        step = np.linalg.solve(
+            jacobian.T @ (jacobian * weight[:, None]) + np.eye(3) / prior_sigma_rad**2,
+            -(jacobian.T @ (weight * residual)) - already / prior_sigma_rad**2,
+        )
+        rotation = _rotation(step) @ rotation
+        if float(np.linalg.norm(step)) < 1e-6:
+            break
+    return rotation
+
+
+def ranges_m(
+    camera: CameraModel,
+    start_px: ArrayLike,
+    end_px: ArrayLike,
+    translation_later_m: ArrayLike,
+    *,
+    later_from_start: ArrayLike | None = None,
+    flow_sigma_px: float = FLOW_SIGMA_PX,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Triangulate tracks with the known translation; forward, sideways or backward, all the same.
+
+    Parameters
+    ----------
+    camera, start_px, end_px
+        The tracks, as seen by the camera (distortion and all).
+    translation_later_m
+        (3,) from the earlier to the later position, in the later camera's axes.
+    later_from_start
+        (3, 3) what rotation is left in the starts (:func:`refine_rotation`); none when not given.
+    flow_sigma_px
+        Noise of the flow, one figure.
+
+    Returns
+    -------
+    Points (N, 3) in the later camera frame and the standard deviation (N,) of their ranges, m. A point without resolvable
+    parallax is put where its parallax would equal the noise, with a deviation as large as its range: only "farther than a fraction of that" is known of it. NaN where a track does not
+    fit the motion (a moving object, a bad track) or lies on the focus.
+    """
+    a, b = camera.pixel_to_ray(start_px), camera.pixel_to_ray(end_px)
+    if later_from_start is not None:
+        a = a @ np.asarray(later_from_start, dtype=np.float64).T
+    translation = _vector(translation_later_m)
+    sigma = math.sqrt(2.0) * flow_sigma_px / camera.fx_px
+    # The earlier camera stands at -t. A point at b * range is seen from there along a: a x (b range + t) = 0.
+    baseline = np.cross(translation, a)
+    reach_m = np.linalg.norm(baseline, axis=1)  # of the baseline, across the line of sight
+    with np.errstate(divide="ignore", invalid="ignore"):
+        plane = baseline / reach_m[:, None]
+        turn = np.cross(a, b)
+        parallax = np.einsum("ij,ij->i", turn, plane)
+        across = np.abs(np.einsum("ij,ij->i", b, plane))
+        inverse, inverse_sigma = parallax / reach_m, sigma / reach_m
+        range_m = 1.0 / np.maximum(inverse, inverse_sigma)
+        sigma_m = range_m**2 * inverse_sigma
+        bad = (across > 3.0 * sigma + 0.25 * np.abs(parallax)) | (parallax < -3.0 * sigma)
+        bad |= ~np.isfinite(range_m) | (reach_m <= 1e-6)
+    points = b * range_m[:, None]
+    points[bad] = np.nan
+    sigma_m[bad] = np.nan
+    return points, sigma_m
+
+
+def free_range_along(
+    points_m: ArrayLike,
+    sigma_m: ArrayLike,
+    ray_camera: ArrayLike,
+    *,
+    half_width_m: float,
+    half_height_m: float,
+    up_camera: ArrayLike | None = None,
+) -> MetricRange | None:
+    """Return how far the vehicle could move along a ray before it meets something that was seen.
+
+    Its cross section is swept along the ray; the first place where three points inside agree within 10 % is a surface. Unknown is
+    never free: without three samples within 4 degrees of the ray there is no answer, and where nothing is met, the answer ends
+    at what those samples show themselves. A sample that is less sure than 35 % of its range vouches only for its
+    lower bound (two standard deviations of its parallax), and is not taken for an obstacle.
+
+    Parameters
+    ----------
+    points_m, sigma_m
+        (N, 3) and (N,) of :func:`ranges_m`; NaN rows are left out.
+    ray_camera
+        (3,) the direction, any length.
+    half_width_m, half_height_m
+        Of the vehicle, with its margin.
+    up_camera
+        (3,) up, in the camera's axes; (0, -1, 0) when not given, which is right for a level camera.
+    """
+    points, sigma = np.asarray(points_m, dtype=np.float64), np.asarray(sigma_m, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or sigma.shape != (len(points),):
+        raise ValueError(f"expected points (N, 3) and sigma (N,), got {points.shape} and {sigma.shape}")
+    finite = np.isfinite(points).all(axis=1) & np.isfinite(sigma)
+    points, sigma = points[finite], sigma[finite]
+    ray = _vector(ray_camera)
+    ray = ray / np.linalg.norm(ray)
+    up = np.array([0.0, -1.0, 0.0]) if up_camera is None else _vector(up_camera)
+    side = np.cross(ray, up)
+    if float(np.linalg.norm(side)) < 1e-3 * float(np.linalg.norm(up)):
+        raise ValueError("the ray is vertical: the vehicle's width and height have no meaning across it")
+    side /= np.linalg.norm(side)
+    vertical = np.cross(side, ray)
+
+    range_m = np.linalg.norm(points, axis=1)
+    along_m = points @ ray
+    resolved = sigma <= _RESOLVED_SHARE * range_m
+    # One standard deviation of parallax is sigma / range^2 of inverse range; two of them nearer is the lower bound.
+    vouched_share = np.where(resolved, 1.0, range_m / (range_m + 2.0 * sigma))
+    near_ray = along_m > math.cos(_KNOWN_HALF_ANGLE_RAD) * range_m
+    if int(near_ray.sum()) < _KNOWN_SAMPLES:
+        return None
+    vouched_m = np.sort((along_m * vouched_share)[near_ray])
+    index = min(len(vouched_m) - 1, max(_KNOWN_SAMPLES - 1, len(vouched_m) // 4))
+    distance_m, spread_m, samples = (
+        float(vouched_m[index]),
+        _spread(vouched_m, sigma[near_ray]),
+        len(vouched_m),
+    )
+
+    inside = resolved & (along_m > 0.0)
+    inside &= (np.abs(points @ side) <= half_width_m) & (np.abs(points @ vertical) <= half_height_m)
+    hits_m = np.sort(along_m[inside])
+    triples = np.flatnonzero(hits_m[_HIT_SAMPLES - 1 :] <= (1.0 + _HIT_SHARE) * hits_m[: 1 - _HIT_SAMPLES])
+    if triples.size:
+        hit_m = float(hits_m[triples[0] + 1])
+        if hit_m < distance_m:
+            of_surface = inside & (np.abs(along_m - hit_m) <= 2.0 * _HIT_SHARE * hit_m)
+            distance_m = hit_m
+            spread_m = _spread(along_m[of_surface], sigma[of_surface])
+            samples = int(of_surface.sum())
+    return MetricRange(distance_m=distance_m, spread_m=spread_m, samples=samples)
+
+
+def _spread(values: NDArray[np.float64], sigma: NDArray[np.float64]) -> float:
+    """Robust standard deviation of the values, at least what their own uncertainty leaves of their mean."""
+    deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    return max(deviation, float(np.median(sigma)) / math.sqrt(len(values)))
+
+
+def _best_hypothesis(
+    middle: NDArray[np.float64], flow: NDArray[np.float64], sigma: float, seed: int
+) -> NDArray[np.float64] | None:
+    """Return the intersection of two tracks' lines that most tracks agree with (truncated squares)."""
+    rng = np.random.default_rng(seed)
+    first, second = rng.integers(0, len(middle), (2, _HYPOTHESES))
+    normal = np.column_stack((-flow[:, 1], flow[:, 0]))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    offset = np.einsum("ij,ij->i", normal, middle)
+    determinant = normal[first, 0] * normal[second, 1] - normal[first, 1] * normal[second, 0]
+    crossing = np.abs(determinant) > 0.02
+    first, second, determinant = first[crossing], second[crossing], determinant[crossing]
+    if determinant.size == 0:
+        return None
+    x = (offset[first] * normal[second, 1] - normal[first, 1] * offset[second]) / determinant
+    y = (normal[first, 0] * offset[second] - offset[first] * normal[second, 0]) / determinant
+    dx, dy = middle[None, :, 0] - x[:, None], middle[None, :, 1] - y[:, None]
+    across = (flow[None, :, 0] * dy - flow[None, :, 1] * dx) / np.maximum(np.hypot(dx, dy), 1e-9)
+    cost = np.minimum((across / sigma) ** 2, 9.0).sum(axis=1)
+    best = int(np.argmin(cost))
+    return np.array([x[best], y[best]])
+
+
+def _across(
+    middle: NDArray[np.float64], flow: NDArray[np.float64], focus: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the flow across the line from the focus, (N,) px, and its derivative by the focus, (N, 2)."""
+    offset = middle - focus
+    radius = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
+    outward = offset / radius[:, None]
+    residual = flow[:, 0] * outward[:, 1] - flow[:, 1] * outward[:, 0]
+    radial = np.einsum("ij,ij->i", flow, outward)
+    # Moving the focus by d turns the outward direction by (d x outward) / r.
+    jacobian = np.column_stack((outward[:, 1], -outward[:, 0])) * (radial / radius)[:, None]
+    return residual, jacobian
+
+
+def _weighted_quantile(values: NDArray[np.float64], weights: NDArray[np.float64], share: float) -> float:
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    position = (cumulative - 0.5 * weights[order]) / cumulative[-1]
+    return float(np.interp(share, position, values[order]))
+
+
+def _rotation(vector_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation of a rotation vector (Rodrigues)."""
+    angle = float(np.linalg.norm(vector_rad))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector_rad / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: NDArray[np.float64] = (
+        np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    )
+    return rotation
+
+
+def _rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation vector of a small rotation (well below a half turn)."""
+    twice_sine_axis = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine = 0.5 * float(np.linalg.norm(twice_sine_axis))
+    return np.asarray(0.5 * twice_sine_axis * (math.asin(min(sine, 1.0)) / sine if sine > 1e-9 else 1.0))
+
+
+def _tracks(start_px: ArrayLike, end_px: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    start, end = np.asarray(start_px, dtype=np.float64), np.asarray(end_px, dtype=np.float64)
+    if start.ndim != 2 or start.shape[1] != 2 or start.shape != end.shape:
+        raise ValueError(f"expected two arrays (N, 2), got {start.shape} and {end.shape}")
+    finite = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
+    return start[finite], end[finite]
+
+
+def _vector(values: ArrayLike) -> NDArray[np.float64]:
+    vector = np.asarray(values, dtype=np.float64)
+    if vector.shape != (3,):
+        raise ValueError(f"expected (3,), got {vector.shape}")
+    return vector

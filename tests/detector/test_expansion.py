@@ -1,0 +1,286 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from detector.camera_model import CameraModel
+from detector.expansion import (
+    fit_focus_of_expansion,
+    focus_of_expansion_from_translation,
+    free_range_along,
+    ideal_px,
+    ranges_m,
+    refine_rotation,
+    time_to_contact_along,
+)
+
+CAMERA = CameraModel.from_hfov(640, 480, 80.0)
+DISTORTED = CameraModel(640, 480, 400.0, 400.0, 320.0, 240.0, (-0.28, 0.07, 0.0, 0.0))
+
+
+def _cloud(
+    rng: np.random.Generator, n: int = 400, nearest_m: float = 2.0, farthest_m: float = 8.0
+) -> np.ndarray:
+    depth = rng.uniform(nearest_m, farthest_m, n)
+    pixels = np.column_stack((rng.uniform(20, 620, n), rng.uniform(20, 460, n)))
+    rays = CAMERA.pixel_to_ray(pixels)
+    return rays / rays[:, 2:] * depth[:, None]
+
+
+def _tracks(
+    points: np.ndarray,
+    translation: tuple[float, float, float],
+    noise_px: float = 0.0,
+    camera: CameraModel = CAMERA,
+    rotation: np.ndarray | None = None,
+    seed: int = 1,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points in the later camera frame; ``rotation`` turns the start rays (an error of attitude)."""
+    rng = np.random.default_rng(seed)
+    before = points + np.array(translation)
+    if rotation is not None:
+        before = before @ rotation.T
+    start = camera.ray_to_pixel(before) + rng.normal(0, noise_px, (len(points), 2))
+    end = camera.ray_to_pixel(points) + rng.normal(0, noise_px, (len(points), 2))
+    return start, end
+
+
+def _small_rotation(x_deg: float, y_deg: float, z_deg: float) -> np.ndarray:
+    x, y, z = np.radians((x_deg, y_deg, z_deg))
+    u, _, vt = np.linalg.svd(np.array([[1, -z, y], [z, 1, -x], [-y, x, 1]]))
+    return u @ vt
+
+
+@settings(max_examples=40, deadline=None)
+@given(x=st.floats(-0.12, 0.12), y=st.floats(-0.08, 0.08), seed=st.integers(0, 50))
+def test_focus_is_found_with_noise_and_bad_tracks(x: float, y: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    translation = (x, y, 0.25)
+    start, end = _tracks(_cloud(rng), translation, 0.2, seed=seed)
+    end[:60] = start[:60] + rng.normal(0, 8, (60, 2))
+    expected = focus_of_expansion_from_translation(CAMERA, translation)
+    assert expected is not None
+    found = fit_focus_of_expansion(start, end)
+    assert found is not None
+    assert np.linalg.norm(found - expected) < 12.0
+
+
+def test_focus_of_known_motion_is_where_the_motion_points() -> None:
+    translation = np.array([0.1, -0.05, 0.3])
+    expected = CAMERA.ray_to_pixel(translation[None])[0]
+    np.testing.assert_allclose(focus_of_expansion_from_translation(CAMERA, translation), expected)
+    np.testing.assert_allclose(focus_of_expansion_from_translation(CAMERA, -translation), expected)
+    assert focus_of_expansion_from_translation(CAMERA, (1, 0, 0)) is None
+    assert focus_of_expansion_from_translation(CAMERA, (0, 0, 0)) is None
+
+
+@pytest.mark.parametrize(
+    ("translation", "noise_px"),
+    [
+        ((0.25, 0.0, 0.0), 0.2),
+        ((0.0, 0.2, 0.001), 0.2),
+        ((0.0, 0.0, 0.0), 0.2),
+        ((0.0, 0.0, -0.25), 0.2),
+        ((0.0, 0.0, 0.002), 0.3),
+    ],
+    ids=["sideways", "upwards", "still", "backwards", "hardly moved"],
+)
+def test_no_focus_where_the_tracks_do_not_determine_one(
+    translation: tuple[float, float, float], noise_px: float
+) -> None:
+    start, end = _tracks(_cloud(np.random.default_rng(0)), translation, noise_px)
+    assert fit_focus_of_expansion(start, end) is None
+
+
+def test_no_focus_from_few_tracks_or_a_turn_left_in() -> None:
+    cloud = _cloud(np.random.default_rng(0))
+    start, end = _tracks(cloud, (0, 0, 0.25))
+    assert fit_focus_of_expansion(start[:8], end[:8]) is None
+    assert fit_focus_of_expansion(start[:0], end[:0]) is None
+    start, end = _tracks(cloud, (0, 0, 0.0), 0.2, rotation=_small_rotation(0, 4, 0))
+    assert fit_focus_of_expansion(start, end) is None
+
+
+@pytest.mark.parametrize("distance_m", [0.8, 1.5, 3.0, 5.0])
+@pytest.mark.parametrize("towards_px", [(319.5, 239.5), (480.0, 200.0)])
+def test_time_to_contact_of_a_wall_from_the_later_frame(
+    distance_m: float, towards_px: tuple[float, float]
+) -> None:
+    points = _cloud(np.random.default_rng(3), nearest_m=distance_m, farthest_m=distance_m)
+    start, end = _tracks(points, (0, 0, 0.25))
+    exact = time_to_contact_along(start, end, (319.5, 239.5), towards_px, 80.0)
+    assert exact is not None
+    assert exact.frames == pytest.approx(distance_m / 0.25, rel=1e-6)
+    start, end = _tracks(points, (0, 0, 0.25), 0.2)
+    noisy = time_to_contact_along(start, end, (319.5, 239.5), towards_px, 80.0)
+    assert noisy is not None
+    assert noisy.frames == pytest.approx(distance_m / 0.25, rel=0.2)
+    assert noisy.samples > 10
+    assert noisy.spread_frames > 0
+
+
+def test_time_to_contact_takes_the_nearer_of_two_things() -> None:
+    rng = np.random.default_rng(5)
+    points = np.vstack((_cloud(rng, 200, 2.0, 2.0), _cloud(rng, 200, 8.0, 8.0)))
+    start, end = _tracks(points, (0, 0, 0.25), 0.2)
+    found = time_to_contact_along(start, end, (319.5, 239.5), (400, 240), 100.0)
+    assert found is not None
+    assert found.frames < 10.0
+
+
+def test_no_time_to_contact_without_samples_or_with_a_wrong_focus() -> None:
+    start, end = _tracks(_cloud(np.random.default_rng(3)), (0, 0, 0.25), 0.2)
+    assert time_to_contact_along(start, end, (319.5, 239.5), (3000, 240), 80.0) is None
+    assert time_to_contact_along(start, end, (320, -5000), (320, 240), 80.0) is None
+    start, end = _tracks(_cloud(np.random.default_rng(3)), (0, 0, -0.25), 0.2)  # going away from it
+    assert time_to_contact_along(start, end, (319.5, 239.5), (450, 240), 80.0) is None
+
+
+def test_time_to_contact_never_exceeds_what_the_noise_lets_one_tell() -> None:
+    start, end = _tracks(_cloud(np.random.default_rng(3), 600, 500.0, 900.0), (0, 0, 0.1), 0.2)
+    found = time_to_contact_along(start, end, (319.5, 239.5), (450, 240), 80.0)
+    assert found is not None
+    assert found.frames < 800.0
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
+@settings(max_examples=30, deadline=None)
+@given(x=st.floats(-0.3, 0.3), y=st.floats(-0.1, 0.1), z=st.floats(-0.3, 0.3))
+def test_exact_tracks_give_exact_points(camera: CameraModel, x: float, y: float, z: float) -> None:
+    if math.hypot(x, y, z) < 0.1:
+        return
+    points = _cloud(np.random.default_rng(2), 120)
+    start, end = _tracks(points, (x, y, z), camera=camera)
+    found, sigma = ranges_m(camera, start, end, (x, y, z), flow_sigma_px=1e-4)
+    known = np.isfinite(sigma) & (sigma < 0.05)
+    assert known.mean() > 0.8
+    np.testing.assert_allclose(found[known], points[known], rtol=1e-3, atol=1e-3)
+
+
+def test_stated_uncertainty_is_the_real_one() -> None:
+    points = _cloud(np.random.default_rng(4), 3000, 2.0, 4.0)
+    start, end = _tracks(points, (0.2, 0.0, 0.15), 0.3)
+    found, sigma = ranges_m(CAMERA, start, end, (0.2, 0.0, 0.15), flow_sigma_px=0.3)
+    resolved = np.isfinite(sigma) & (sigma < 0.15 * np.linalg.norm(points, axis=1))
+    error = (np.linalg.norm(found, axis=1) - np.linalg.norm(points, axis=1))[resolved] / sigma[resolved]
+    assert resolved.mean() > 0.5
+    assert 0.7 < np.std(error) < 1.4
+    assert abs(np.median(error)) < 0.2
+
+
+def test_a_point_without_parallax_is_only_known_to_be_far() -> None:
+    start, end = _tracks(_cloud(np.random.default_rng(4), 100, 400.0, 900.0), (0, 0, 0.2))
+    found, sigma = ranges_m(CAMERA, start, end, (0, 0, 0.2))
+    kept = np.isfinite(sigma)
+    assert kept.mean() > 0.9
+    np.testing.assert_array_less(0.9 * np.linalg.norm(found[kept], axis=1), sigma[kept] + 1e-9)
+
+
+def test_tracks_that_do_not_fit_the_motion_are_left_out() -> None:
+    points = _cloud(np.random.default_rng(4), 100)
+    start, end = _tracks(points, (0, 0, 0.2))
+    end[:10] += (0, 25.0)
+    start[10:20], end[10:20] = (
+        end[10:20].copy(),
+        start[10:20].copy(),
+    )  # contracting: impossible when moving forward
+    moved = np.linalg.norm(end - start, axis=1) > 4
+    found, sigma = ranges_m(CAMERA, start, end, (0, 0, 0.2))
+    assert np.isnan(sigma[:20][moved[:20]]).mean() > 0.7
+    assert np.isnan(found[:20][moved[:20]]).any(axis=1).mean() > 0.7
+
+
+@pytest.mark.parametrize("translation", [(0.0, 0.0, 0.25), (0.2, 0.0, 0.1), (0.25, 0.02, 0.0)])
+def test_an_error_of_the_attitude_is_found(translation: tuple[float, float, float]) -> None:
+    points = _cloud(np.random.default_rng(8), 500)
+    error = _small_rotation(0.2, -0.25, 0.15)
+    start, end = _tracks(points, translation, 0.2, rotation=error)
+    correction = refine_rotation(CAMERA, start, end, translation, prior_sigma_rad=math.radians(0.3))
+    left = correction @ error
+    left_deg = math.degrees(math.acos(min(1.0, (np.trace(left) - 1) / 2)))
+    assert left_deg < 0.12  # of 0.35
+    exact = refine_rotation(
+        CAMERA, *_tracks(points, translation), translation, prior_sigma_rad=math.radians(0.3)
+    )
+    np.testing.assert_allclose(exact, np.eye(3), atol=1e-5)
+
+
+def _wall(
+    distance_m: float, east_m: tuple[float, float], down_m: tuple[float, float], n: int = 150
+) -> np.ndarray:
+    rng = np.random.default_rng(9)
+    return np.column_stack((rng.uniform(*east_m, n), rng.uniform(*down_m, n), np.full(n, distance_m)))
+
+
+def _free(
+    points: np.ndarray, ray: tuple[float, float, float] = (0, 0, 1), share: float = 0.05
+) -> float | None:
+    sigma = share * np.linalg.norm(points, axis=1)
+    found = free_range_along(points, sigma, ray, half_width_m=0.35, half_height_m=0.2)
+    return None if found is None else found.distance_m
+
+
+def test_the_swept_vehicle_meets_what_its_width_meets() -> None:
+    far = _wall(6.0, (-3, 3), (-1, 1), 600)
+    assert _free(far) == pytest.approx(6.0)
+    beside = _wall(2.0, (0.2, 0.33), (-0.1, 0.1))  # within the half width, outside 4 degrees
+    assert _free(np.vstack((far, beside))) == pytest.approx(2.0)
+    clear = _wall(2.0, (0.4, 0.6), (-0.1, 0.1))
+    assert _free(np.vstack((far, clear))) == pytest.approx(6.0)
+    below = _wall(2.0, (-0.3, 0.3), (0.25, 0.5))
+    assert _free(np.vstack((far, below))) == pytest.approx(6.0)
+
+
+def test_unknown_is_not_free() -> None:
+    assert _free(np.empty((0, 3))) is None
+    assert _free(_wall(6.0, (1.5, 3), (-1, 1))) is None
+    points = _wall(6.0, (-3, 3), (-1, 1), 600)
+    unknown = free_range_along(points, np.full(600, np.nan), (0, 0, 1), half_width_m=0.35, half_height_m=0.2)
+    assert unknown is None
+
+
+def test_unsure_samples_vouch_for_their_lower_bound_only() -> None:
+    far = _wall(10.0, (-5, 5), (-1, 1), 600)
+    found = _free(far, share=1.0)
+    assert found is not None
+    assert found == pytest.approx(10.0 / 3.0, rel=0.02)
+    # and one noisy nearest sample is no obstacle
+    assert _free(np.vstack((far, [[0.0, 0.0, 1.0]]))) == pytest.approx(10.0)
+
+
+def test_up_turns_with_the_camera() -> None:
+    far = _wall(6.0, (-3, 3), (-3, 3), 2000)
+    post = _wall(2.0, (-0.02, 0.02), (0.25, 0.33))
+    points = np.vstack((far, post))
+    sigma = 0.05 * np.linalg.norm(points, axis=1)
+    level = free_range_along(points, sigma, (0, 0, 1), half_width_m=0.35, half_height_m=0.2)
+    rolled = free_range_along(
+        points, sigma, (0, 0, 1), half_width_m=0.35, half_height_m=0.2, up_camera=(1, 0, 0)
+    )
+    assert level is not None
+    assert rolled is not None
+    assert level.distance_m == pytest.approx(6.0)
+    assert rolled.distance_m == pytest.approx(2.0)
+    with pytest.raises(ValueError, match="vertical"):
+        free_range_along(points, sigma, (0, 1, 0), half_width_m=0.35, half_height_m=0.2)
+
+
+def test_ideal_pixels_lie_where_a_lens_without_distortion_puts_them() -> None:
+    pixels = np.array([[30.0, 40.0], [320.0, 240.0], [600.0, 400.0]])
+    rays = DISTORTED.pixel_to_ray(pixels)
+    ideal = CameraModel(640, 480, 400.0, 400.0, 320.0, 240.0)
+    np.testing.assert_allclose(ideal_px(DISTORTED, pixels), ideal.ray_to_pixel(rays))
+    np.testing.assert_array_equal(ideal_px(CAMERA, pixels), pixels)
+
+
+def test_shapes_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"expected two arrays \(N, 2\)"):
+        fit_focus_of_expansion(np.zeros((3, 2)), np.zeros((4, 2)))
+    with pytest.raises(ValueError, match=r"expected \(3,\)"):
+        focus_of_expansion_from_translation(CAMERA, (1, 2))
+    with pytest.raises(ValueError, match=r"expected points \(N, 3\)"):
+        free_range_along(np.zeros((3, 3)), np.zeros(2), (0, 0, 1), half_width_m=1, half_height_m=1)

@@ -1,0 +1,107 @@
+"""What became of every frame between a planner and a fake autopilot: nothing lost, nothing altered, z kept."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from companion.mavlink.framing import Framer, FramingCounters, RawFrame
+
+_SETPOINT = 84
+_Z = slice(12, 16)
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Setpoints and other frames at both ends.
+
+    Attributes
+    ----------
+    setpoints_sent, setpoints_received
+        SET_POSITION_TARGET_LOCAL_NED that left the planner and that reached the autopilot.
+    setpoints_lost
+        Sent, not received (those that the companion dropped on purpose included).
+    z_changed
+        Received with other bytes of z than were sent.
+    other_sent
+        All other frames that left either end.
+    other_lost, other_altered
+        Of those, the ones that did not arrive at all, and the ones that arrived with other bytes.
+    """
+
+    setpoints_sent: int
+    setpoints_received: int
+    setpoints_lost: int
+    z_changed: int
+    other_sent: int
+    other_lost: int
+    other_altered: int
+
+
+def compare(
+    planner_sent: Iterable[bytes],
+    autopilot_received: Iterable[bytes],
+    autopilot_sent: Iterable[bytes],
+    planner_received: Iterable[bytes],
+) -> Comparison:
+    """Compare what left each end with what reached the other; frames as bytes, in order.
+
+    Frames of other senders (the companion's own HEARTBEAT and STATUSTEXT) are left out of what was received.
+    """
+    up_sent, up_received = _frames(planner_sent), _frames(autopilot_received)
+    sent = [frame for frame in up_sent if frame.message_id == _SETPOINT]
+    received = [frame for frame in up_received if frame.message_id == _SETPOINT]
+    lost, z_changed = _match_setpoints(sent, received)
+    up = _match_others(up_sent, up_received)
+    down = _match_others(_frames(autopilot_sent), _frames(planner_received))
+    return Comparison(
+        setpoints_sent=len(sent),
+        setpoints_received=len(received),
+        setpoints_lost=lost,
+        z_changed=z_changed,
+        other_sent=up[0] + down[0],
+        other_lost=up[1] + down[1],
+        other_altered=up[2] + down[2],
+    )
+
+
+def _frames(chunks: Iterable[bytes]) -> list[RawFrame]:
+    framer = Framer(FramingCounters())
+    return [frame for chunk in chunks for frame in framer.feed(chunk)]
+
+
+def _seq(frame: RawFrame) -> int:
+    return frame.data[2] if frame.is_v1 else frame.data[4]
+
+
+def _z(frame: RawFrame) -> bytes:
+    return frame.payload.ljust(53, b"\0")[_Z]
+
+
+def _match_setpoints(sent: Sequence[RawFrame], received: Sequence[RawFrame]) -> tuple[int, int]:
+    """Walk both in order; a sequence number that does not come next was lost."""
+    lost = z_changed = 0
+    position = 0
+    for frame in sent:
+        if position < len(received) and _seq(received[position]) == _seq(frame):
+            z_changed += _z(received[position]) != _z(frame)
+            position += 1
+        else:
+            lost += 1
+    # Received but never sent: none of them is the planner's.
+    return lost, z_changed + len(received) - position
+
+
+def _match_others(sent: Sequence[RawFrame], received: Sequence[RawFrame]) -> tuple[int, int, int]:
+    senders = {(frame.system_id, frame.component_id) for frame in sent}
+    out = Counter(frame.data for frame in sent if frame.message_id != _SETPOINT)
+    back = Counter(
+        frame.data
+        for frame in received
+        if frame.message_id != _SETPOINT and (frame.system_id, frame.component_id) in senders
+    )
+    missing = sum((out - back).values())
+    strange = sum((back - out).values())
+    altered = min(missing, strange)
+    return sum(out.values()), missing - altered, strange

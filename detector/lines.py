@@ -1,0 +1,131 @@
+"""Line segments in the lower half of the second frame (paper section 2.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_VOTES_MIN = 5
+"""Fewer votes than this find lines in noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class HoughSettings:
+    """Settings of the probabilistic Hough transform, in px of this image."""
+
+    votes: int
+    min_length_px: float
+    max_gap_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class AngleGate:
+    """Lines count when their angle to the horizontal lies strictly between the two, and not too near to vertical."""
+
+    min_deg: float = 40.0
+    max_deg: float = 140.0
+    vertical_gap_deg: float = 0.0
+
+
+def edges(lower_half: NDArray[np.uint8], low: float = 0.67, high: float = 1.33) -> NDArray[np.uint8]:
+    """Return Canny edges after a 5 x 5 Gaussian blur, thresholds relative to the median grey of the region."""
+    median = float(np.median(lower_half))
+    blurred = cv2.GaussianBlur(lower_half, (5, 5), 0)
+    return np.asarray(cv2.Canny(blurred, low * median, high * median), dtype=np.uint8)
+
+
+def find_segments(edge_image: NDArray[np.uint8], top_px: int, settings: HoughSettings) -> NDArray[np.float64]:
+    """Return the (K, 4) segments x1, y1, x2, y2 in px of the full image, rho 1 px and theta 1 degree.
+
+    ``top_px`` is the row of the full image where ``edge_image`` begins.
+    """
+    found = cv2.HoughLinesP(
+        edge_image,
+        1.0,
+        np.pi / 180.0,
+        settings.votes,
+        minLineLength=settings.min_length_px,
+        maxLineGap=settings.max_gap_px,
+    )
+    # OpenCV gives None for no line at all, whatever its annotations say.
+    segments = np.zeros((0, 4)) if found is None else np.asarray(found, np.float64).reshape(-1, 4)
+    return np.asarray(segments + np.array([0.0, top_px, 0.0, top_px]), np.float64)
+
+
+def angles_deg(segments_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angle beta of each segment to the horizontal, in [0, 180)."""
+    delta = segments_px[:, 2:] - segments_px[:, :2]
+    angles: NDArray[np.float64] = np.degrees(np.arctan2(delta[:, 1], delta[:, 0])) % 180.0
+    angles[angles >= 180.0] = 0.0
+    return angles
+
+
+def gate(segments_px: NDArray[np.float64], gate_: AngleGate) -> NDArray[np.bool_]:
+    """Return which segments are neither nearly horizontal nor, if so asked, nearly vertical."""
+    beta = angles_deg(segments_px)
+    kept = (beta > gate_.min_deg) & (beta < gate_.max_deg)
+    if gate_.vertical_gap_deg > 0.0:
+        kept &= np.abs(beta - 90.0) >= gate_.vertical_gap_deg
+    return kept
+
+
+def lower_half_lines(
+    image: NDArray[np.uint8],
+    settings: HoughSettings,
+    gate_: AngleGate,
+    *,
+    edge_low: float = 0.67,
+    edge_high: float = 1.33,
+    wanted: int = 0,
+) -> tuple[NDArray[np.float64], int]:
+    """Return the segments that pass the gate and the number found before it.
+
+    Parameters
+    ----------
+    image
+        (H, W) uint8, the whole second frame.
+    settings
+        Hough settings; with ``wanted`` the votes are only the starting point.
+    gate_
+        Rule on beta.
+    edge_low, edge_high
+        Canny thresholds over the median grey.
+    wanted
+        0: votes fixed. Else: the largest number of votes for which at least ``wanted`` segments pass the gate. The
+        paper tunes the transform by hand to reach about 10.
+
+    Returns
+    -------
+    (K', 4) segments in px of the full image, and K.
+    """
+    top = image.shape[0] // 2
+    edge_image = edges(image[top:], edge_low, edge_high)
+
+    def with_votes(votes: int) -> tuple[NDArray[np.float64], int]:
+        found = find_segments(
+            edge_image, top, HoughSettings(votes, settings.min_length_px, settings.max_gap_px)
+        )
+        return found[gate(found, gate_)], len(found)
+
+    best = with_votes(settings.votes)
+    if wanted == 0 or len(best[0]) == wanted:
+        return best
+    # Fewer votes find more lines: bisect between what gives too few and what gives enough.
+    if len(best[0]) > wanted:
+        low, high = settings.votes, max(settings.votes + 1, int(np.hypot(*edge_image.shape)))
+    else:
+        low, high = min(_VOTES_MIN, settings.votes), settings.votes
+        best = with_votes(low)
+        if len(best[0]) <= wanted:
+            return best
+    while high - low > max(1, low // 8):  # within an eighth is near enough, and each try costs a transform
+        middle = (low + high) // 2
+        tried = with_votes(middle)
+        if len(tried[0]) >= wanted:
+            low, best = middle, tried
+        else:
+            high = middle
+    return best

@@ -1,0 +1,479 @@
+"""The paper's method for one pair of frames: features, flow, filters, clusters, lines, vote (Fig. 1).
+
+Rotation convention: see :mod:`detector.flow`. With ``later_from_earlier`` given, the starts of the vectors are moved
+into the second camera's orientation; ends, cluster centres and (x_d, y_d) are real pixels of the second frame.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector import clusters, expansion, flow, lines, outliers, vanishing_point, vote
+from detector.camera_model import CameraModel
+from detector.features import feature_locations
+from detector.flow import Tracks
+from detector.frame_quality import frame_fault
+from detector.params import DetectorParams, scaled_px
+from detector.results import (
+    Detection,
+    Diagnostics,
+    Direction,
+    DirectionKind,
+    NoDetection,
+    NoDetectionReason,
+    SinglePlane,
+    TimeToContact,
+)
+from detector.rotation import parallax_px
+
+Timer = Callable[[], float]
+
+_ASSUMED_HFOV_DEG: Final = 70.0
+"""Field of view taken for the check on pure rotation where no camera is known; a wrong one hardly matters there."""
+_MIN_TRACKS: Final = 10
+"""Fewer vectors than this say nothing about motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairResult:
+    """The answer to one pair, and what it was seen by.
+
+    Attributes
+    ----------
+    detection
+        The answer.
+    tracks
+        The N' vectors behind the distribution filter: the length and angular filters drop what is slow or unusual, and both
+        may be far, or near. Starts are in the second camera's orientation where the rotation was given.
+    focus_px
+        Focus of expansion in the image without distortion, where it is known: from the translation given, else fitted to the flow.
+    """
+
+    detection: Detection
+    tracks: Tracks
+    focus_px: tuple[float, float] | None
+
+
+class _Stop(Exception):  # noqa: N818 - not an error: the way out of the steps, caught in detect()
+    """No detection, with its reason."""
+
+    def __init__(self, reason: NoDetectionReason, detail: str) -> None:
+        super().__init__(detail)
+        self.reason = reason
+        self.detail = detail
+
+
+class _Notes:
+    """Collects the diagnostics of one pair while its steps run."""
+
+    def __init__(self, timer: Timer) -> None:
+        self._timer = timer
+        self.fields: dict[str, Any] = {}
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time one step, also when it ends the pair."""
+        begin = self._timer()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + self._timer() - begin
+
+    def diagnostics(self) -> Diagnostics:
+        return Diagnostics(**self.fields, seconds=self.seconds)
+
+
+class VoidDetector:
+    """The paper's method with its memory: p, n and k are estimated in the first loop and kept in the others.
+
+    Parameters
+    ----------
+    params
+        All settings.
+    timer
+        Gives seconds, for the time of each step; the machine's performance counter by default.
+    """
+
+    def __init__(self, params: DetectorParams, *, timer: Timer | None = None) -> None:
+        self.params = params
+        self._timer: Timer = time.perf_counter if timer is None else timer
+        self._starts = clusters.seeded_starts(params.seed, params.kmeans_restarts)
+        self._p: int | None = None
+        self._n: int | None = None
+        self._k: int | None = None
+
+    def reset(self) -> None:
+        """Forget p, n and k: the scene has changed, the next pair is a first loop."""
+        self._p = self._n = self._k = None
+
+    def detect(
+        self,
+        earlier: NDArray[np.uint8],
+        later: NDArray[np.uint8],
+        *,
+        camera: CameraModel | None = None,
+        later_from_earlier: NDArray[np.float64] | None = None,
+        translation_earlier: NDArray[np.float64] | None = None,
+    ) -> PairResult:
+        """Return the answer to one pair of frames.
+
+        Parameters
+        ----------
+        earlier, later
+            (H, W) uint8.
+        camera
+            Needed to take a rotation out and to use a translation.
+        later_from_earlier
+            (3, 3) rotation that takes coordinates of the earlier camera to those of the later one.
+        translation_earlier
+            (3,) how the camera moved, in the earlier camera's axes; any length.
+
+        Raises
+        ------
+        ValueError
+            When an image is not (H, W) uint8, or a rotation or translation comes without a camera.
+        """
+        for name, image in (("earlier", earlier), ("later", later)):
+            if image.ndim != 2 or image.dtype != np.uint8:
+                raise ValueError(f"{name}: expected (H, W) uint8, got {image.shape} {image.dtype}")
+        if camera is None and not (later_from_earlier is None and translation_earlier is None):
+            raise ValueError("a rotation or translation needs a camera model")
+        notes = _Notes(self._timer)
+        tracks = Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
+        focus: NDArray[np.float64] | None = None
+        try:
+            self._check_frames(earlier, later, camera)
+            points = self._features(earlier, later, notes)
+            raw, tracks = self._flow(earlier, later, points, camera, later_from_earlier, notes)
+            self._check_motion(raw, tracks, camera, later_from_earlier is not None, later.shape, notes)
+            with notes.step("contact"):
+                focus = self._focus(tracks, camera, later_from_earlier, translation_earlier)
+            if focus is not None:
+                notes.fields["focus_of_expansion_px"] = (float(focus[0]), float(focus[1]))
+            kept = self._filter(tracks, notes)
+            detection = self._decide(later, kept, tracks, focus, camera, notes)
+        except _Stop as stop:
+            detection = NoDetection(stop.reason, stop.detail, notes.diagnostics())
+        at = None if focus is None else (float(focus[0]), float(focus[1]))
+        return PairResult(detection, tracks, at)
+
+    # ------------------------------------------------------------------ 2.1
+
+    def _check_frames(
+        self, earlier: NDArray[np.uint8], later: NDArray[np.uint8], camera: CameraModel | None
+    ) -> None:
+        if earlier.shape != later.shape:
+            raise _Stop(
+                NoDetectionReason.WRONG_SIZE,
+                f"frames of {_size(earlier)} and {_size(later)}: they must be of one size",
+            )
+        if camera is not None and later.shape != (camera.height_px, camera.width_px):
+            raise _Stop(
+                NoDetectionReason.WRONG_SIZE,
+                f"frames of {_size(later)}, the camera model is for {camera.width_px} x {camera.height_px}",
+            )
+        for name, image in (("earlier", earlier), ("later", later)):
+            fault = frame_fault(image, self.params)
+            if fault is not None:
+                raise _Stop(fault.reason, f"{name} frame: {fault.detail}")
+
+    def _features(
+        self, earlier: NDArray[np.uint8], later: NDArray[np.uint8], notes: _Notes
+    ) -> NDArray[np.float32]:
+        params = self.params
+        with notes.step("features"):
+            points, others = (
+                feature_locations(
+                    image,
+                    octave_layers=params.sift_octave_layers,
+                    contrast=params.sift_contrast,
+                    unique=params.unique_locations,
+                )
+                for image in (earlier, later)
+            )
+        notes.fields["n_features_earlier"], notes.fields["n_features_later"] = len(points), len(others)
+        for reason, found in (
+            (NoDetectionReason.TOO_FEW_FEATURES_EARLIER, points),
+            (NoDetectionReason.TOO_FEW_FEATURES_LATER, others),
+        ):
+            if len(found) < params.min_features:
+                raise _Stop(reason, f"{len(found)} key points, at least {params.min_features} needed")
+        return points
+
+    # ------------------------------------------------------------------ 2.2
+
+    def _flow(
+        self,
+        earlier: NDArray[np.uint8],
+        later: NDArray[np.uint8],
+        points: NDArray[np.float32],
+        camera: CameraModel | None,
+        later_from_earlier: NDArray[np.float64] | None,
+        notes: _Notes,
+    ) -> tuple[Tracks, Tracks]:
+        """Track there and back; return the N' vectors as seen, and with the rotation taken out."""
+        params = self.params
+
+        def follow(
+            a: NDArray[np.uint8],
+            b: NDArray[np.uint8],
+            at: NDArray[np.float32],
+            guess: NDArray[np.float64] | None,
+        ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+            return flow.track(
+                a,
+                b,
+                at,
+                window_px=params.lk_window_px,
+                levels=params.lk_levels,
+                iterations=params.lk_iterations,
+                epsilon_px=params.lk_epsilon_px,
+                guess_px=guess,
+            )
+
+        with notes.step("flow"):
+            guess_there: NDArray[np.float64] | None = None
+            if camera is not None and later_from_earlier is not None and params.lk_predict_rotation:
+                predicted = flow.derotate(points, camera, later_from_earlier)
+                guess_there = np.where(np.isfinite(predicted), predicted, points)
+            ends, there = follow(earlier, later, points, guess_there)
+            # What was not found there cannot come back; its end stands for it so that the arrays stay aligned.
+            guess_back = None if guess_there is None else np.asarray(points, np.float64)
+            returned, back = follow(later, earlier, ends, guess_back)
+            home = flow.distribution_filter(points, returned, params.round_trip_px)
+            kept: NDArray[np.bool_] = there & back & home
+            raw = Tracks(points[kept].astype(np.float64), ends[kept].astype(np.float64))
+            tracks = raw
+            if camera is not None and later_from_earlier is not None and len(raw):
+                starts = flow.derotate(raw.start_px, camera, later_from_earlier)
+                seen = np.asarray(np.isfinite(starts).all(axis=1), np.bool_)
+                raw, tracks = raw[seen], Tracks(starts[seen], raw.end_px[seen])
+        notes.fields["n_tracks"] = int(there.sum())
+        notes.fields["n_after_distribution"] = len(tracks)
+        return raw, tracks
+
+    def _check_motion(
+        self,
+        raw: Tracks,
+        tracks: Tracks,
+        camera: CameraModel | None,
+        derotated: bool,
+        shape: tuple[int, ...],
+        notes: _Notes,
+    ) -> None:
+        """Stop where the camera did not move: a standing or turning camera is no wall and sees no depth."""
+        params = self.params
+        if len(tracks) < _MIN_TRACKS:
+            raise _Stop(
+                NoDetectionReason.TOO_LITTLE_FLOW, f"{len(tracks)} vectors came back to where they started"
+            )
+        height_px, width_px = shape[:2]
+        median_px = float(np.median(tracks.lengths_px))
+        notes.fields["median_flow_px"] = median_px
+        limit_px = max(scaled_px(params.still_flow_px_at_1280, width_px), params.still_flow_floor_px)
+        if median_px < limit_px:
+            raise _Stop(
+                NoDetectionReason.NO_MOTION, f"median flow {median_px:.2f} px, limit {limit_px:.2f} px"
+            )
+        if derotated or not params.rotation_check:
+            return
+        with notes.step("flow"):
+            judged = camera or CameraModel.from_hfov(width_px, height_px, _ASSUMED_HFOV_DEG)
+            left_px = parallax_px(judged, raw)
+        limit_px = max(scaled_px(params.parallax_px_at_1280, width_px), params.still_flow_floor_px)
+        if left_px < limit_px:
+            raise _Stop(
+                NoDetectionReason.NO_MOTION,
+                f"a turn alone leaves {left_px:.2f} px of flow, limit {limit_px:.2f} px",
+            )
+
+    def _filter(self, tracks: Tracks, notes: _Notes) -> Tracks:
+        """Length and angular filters: N' -> N'' -> N'''."""
+        params = self.params
+        with notes.step("flow"):
+            longer = tracks[outliers.length_filter(tracks.lengths_px, params.shortest_fraction)]
+            spread = outliers.angle_spread(longer.angles_deg, params.angle_statistics)
+            if self._p is None:
+                self._p = outliers.choose_p(spread, params.angle_gain)
+            kept = longer[outliers.angular_filter(spread, self._p)]
+        notes.fields.update(n_after_length=len(longer), n_after_angle=len(kept), p=self._p)
+        if len(kept) < params.min_flow_vectors:
+            raise _Stop(
+                NoDetectionReason.TOO_LITTLE_FLOW,
+                f"{len(kept)} flow vectors left, at least {params.min_flow_vectors} needed",
+            )
+        return kept
+
+    def _decide(
+        self,
+        later: NDArray[np.uint8],
+        kept: Tracks,
+        tracks: Tracks,
+        focus: NDArray[np.float64] | None,
+        camera: CameraModel | None,
+        notes: _Notes,
+    ) -> Detection:
+        params = self.params
+        width_px = later.shape[1]
+        with notes.step("clusters"):
+            magnitudes = self._magnitudes(kept, focus, camera)
+            centres, k = self._cluster(kept, magnitudes)
+            centre_magnitudes = clusters.nearest_magnitudes(centres, kept.end_px, magnitudes, k)
+            lowest = int(np.argmin(centre_magnitudes))
+            lmcc, lmcc_magnitude = centres[lowest], float(centre_magnitudes[lowest])
+            if params.plane_test == "deviation_px":
+                statistic = clusters.plane_deviation(centre_magnitudes)
+                threshold = scaled_px(params.plane_deviation_px_at_1280, width_px)
+            else:
+                statistic, threshold = clusters.plane_ratio(centre_magnitudes), params.plane_ratio
+        notes.fields.update(
+            n=len(centres),
+            k=k,
+            centre_points_px=tuple((float(x), float(y)) for x, y in centres),
+            centre_magnitudes_px=tuple(float(m) for m in centre_magnitudes),
+            lmcc_px=(float(lmcc[0]), float(lmcc[1])),
+            lmcc_magnitude_px=lmcc_magnitude,
+            plane_statistic=statistic,
+            plane_threshold=threshold,
+        )
+        if statistic < threshold:
+            with notes.step("contact"):
+                # One plane: every vector of it says the same, so the whole view answers.
+                middle = np.array([0.5 * width_px, 0.5 * later.shape[0]])
+                contact = self._contact(tracks, focus, camera, middle, gate_px=float(width_px))
+            return SinglePlane(contact, notes.diagnostics())
+        with notes.step("lines"):
+            candidates = self._candidates(later, centres, notes)
+        with notes.step("vote"):
+            elected = vote.elect(
+                candidates, lmcc, lmcc_magnitude, kept.end_px, magnitudes, k, params.vote_tolerance
+            )
+        at = lmcc if elected is None else elected
+        with notes.step("contact"):
+            gate_px = scaled_px(params.contact_gate_px_at_1280, width_px)
+            contact = self._contact(tracks, focus, camera, at, gate_px=gate_px)
+        kind = DirectionKind.LOWEST_FLOW if elected is None else DirectionKind.VANISHING_POINT
+        return Direction(float(at[0]), float(at[1]), kind, contact, notes.diagnostics())
+
+    def _cluster(self, kept: Tracks, magnitudes: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+        """Return the (n, 2) cluster centres in the image and k; n and k are chosen in the first loop."""
+        params = self.params
+        samples = clusters.samples_of(kept.end_px, kept.angles_deg)
+        if self._n is None:
+            clustering = clusters.choose_n(
+                samples,
+                self._starts,
+                n_min=params.clusters_min,
+                n_max=params.clusters_max,
+                max_iterations=params.kmeans_iterations,
+            )
+            self._n = clustering.n
+        else:
+            clustering = clusters.best_of(
+                samples, min(self._n, len(samples) - 1), self._starts, params.kmeans_iterations
+            )
+        centres = clustering.centres[:, :2]
+        if self._k is None:
+            self._k = clusters.choose_k(
+                centres,
+                kept.end_px,
+                magnitudes,
+                step=params.nearest_step,
+                steps=params.nearest_steps,
+                change=params.nearest_change,
+            )
+        return centres, self._k
+
+    def _magnitudes(
+        self, kept: Tracks, focus: NDArray[np.float64] | None, camera: CameraModel | None
+    ) -> NDArray[np.float64]:
+        """Return what "magnitude" means: the length of the flow, or 1 / time to contact where the focus is known."""
+        if self.params.depth_cue == "flow" or focus is None:
+            return kept.lengths_px
+        starts = kept.start_px if camera is None else expansion.ideal_px(camera, kept.start_px)
+        radius = np.linalg.norm(starts - focus, axis=1)
+        inverse: NDArray[np.float64] = kept.lengths_px / np.maximum(radius, 1.0)
+        return inverse
+
+    # ------------------------------------------------------------------ 2.3
+
+    def _candidates(
+        self, later: NDArray[np.uint8], centres: NDArray[np.float64], notes: _Notes
+    ) -> NDArray[np.float64]:
+        params = self.params
+        height_px, width_px = later.shape
+        settings = lines.HoughSettings(
+            votes=max(1, round(scaled_px(params.hough_votes_at_1280, width_px))),
+            min_length_px=scaled_px(params.hough_min_length_px_at_1280, width_px),
+            max_gap_px=scaled_px(params.hough_max_gap_px_at_1280, width_px),
+        )
+        gate = lines.AngleGate(params.line_angle_min_deg, params.line_angle_max_deg, params.vertical_gap_deg)
+        segments, n_lines = lines.lower_half_lines(
+            later,
+            settings,
+            gate,
+            edge_low=params.edge_low,
+            edge_high=params.edge_high,
+            wanted=params.lines_wanted,
+        )
+        found = vanishing_point.candidates(
+            segments,
+            centres,
+            (width_px, height_px),
+            pair_min_deg=params.pair_angle_min_deg,
+            pair_max_deg=params.pair_angle_max_deg,
+            cell_px=params.cell_px,
+        )
+        notes.fields.update(
+            n_lines=n_lines,
+            lines_px=tuple((float(a), float(b), float(c), float(d)) for a, b, c, d in segments),
+            candidates_px=tuple((float(x), float(y)) for x, y in found),
+        )
+        return found
+
+    # ------------------------------------------------------------------ time to contact
+
+    @staticmethod
+    def _focus(
+        tracks: Tracks,
+        camera: CameraModel | None,
+        later_from_earlier: NDArray[np.float64] | None,
+        translation_earlier: NDArray[np.float64] | None,
+    ) -> NDArray[np.float64] | None:
+        if camera is not None and translation_earlier is not None:
+            rotation = np.eye(3) if later_from_earlier is None else later_from_earlier
+            return expansion.focus_of_expansion_from_translation(camera, rotation @ translation_earlier)
+        if camera is None:
+            return expansion.fit_focus_of_expansion(tracks.start_px, tracks.end_px)
+        return expansion.fit_focus_of_expansion(
+            expansion.ideal_px(camera, tracks.start_px), expansion.ideal_px(camera, tracks.end_px)
+        )
+
+    @staticmethod
+    def _contact(
+        tracks: Tracks,
+        focus: NDArray[np.float64] | None,
+        camera: CameraModel | None,
+        towards_px: NDArray[np.float64],
+        *,
+        gate_px: float,
+    ) -> TimeToContact | None:
+        if focus is None:
+            return None
+        start, end, towards = tracks.start_px, tracks.end_px, towards_px
+        if camera is not None:
+            start, end = expansion.ideal_px(camera, start), expansion.ideal_px(camera, end)
+            towards = expansion.ideal_px(camera, towards_px[None, :])[0]
+        return expansion.time_to_contact_along(start, end, focus, towards, gate_px)
+
+
+def _size(image: NDArray[np.uint8]) -> str:
+    return f"{image.shape[1]} x {image.shape[0]} px"

@@ -51,7 +51,9 @@ def seeded_starts(seed: int, restarts: int) -> Starts:
     return starts
 
 
-def kmeans(samples: NDArray[np.float64], initial: NDArray[np.float64], max_iterations: int = 300) -> Clustering:
+def kmeans(
+    samples: NDArray[np.float64], initial: NDArray[np.float64], max_iterations: int = 300
+) -> Clustering:
     """Lloyd's algorithm from given centres until no sample changes its cluster.
 
     Parameters

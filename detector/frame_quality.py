@@ -40,7 +40,9 @@ def perceptual_blur(image: NDArray[np.uint8]) -> float:
     width = image.shape[1]
     if width > _BLUR_WIDTH_PX:
         scale = _BLUR_WIDTH_PX / width
-        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        image = np.asarray(
+            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+        )
     # A light smoothing first: sensor noise varies from pixel to pixel and would pass for sharpness.
     grey = cv2.GaussianBlur(image, (3, 3), 0).astype(np.float32)
     worst = 0.0
@@ -80,7 +82,8 @@ def frame_fault(image: NDArray[np.uint8], params: DetectorParams) -> FrameFault 
     bright = float(np.percentile(image, 98.0))
     if bright < params.black_grey:
         return FrameFault(
-            NoDetectionReason.BLACK, f"98 % of the pixels below grey {bright:.0f}, limit {params.black_grey:.0f}"
+            NoDetectionReason.BLACK,
+            f"98 % of the pixels below grey {bright:.0f}, limit {params.black_grey:.0f}",
         )
     blur = perceptual_blur(image)
     if blur > params.blur_limit:

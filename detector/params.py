@@ -66,13 +66,12 @@ class DetectorParams(BaseModel):
 
     # ------------------------------------------------------------------ 2.1 features
     sift_octave_layers: Annotated[
-        int, Field(ge=1, le=8, description="Layers an octave of the SIFT detector (section 2.1; notebook: 3).")
+        int,
+        Field(ge=1, le=8, description="Layers an octave of the SIFT detector (section 2.1; notebook: 3)."),
     ] = 3
     sift_contrast: Annotated[
         float,
-        Field(
-            ge=0, le=1, description="SIFT contrast threshold (section 2.1; OpenCV's 0.04). Larger: fewer."
-        ),
+        Field(ge=0, le=1, description="SIFT contrast threshold (section 2.1; OpenCV's 0.04). Larger: fewer."),
     ] = 0.04
     unique_locations: Annotated[
         bool,
@@ -149,7 +148,9 @@ class DetectorParams(BaseModel):
     still_flow_floor_px: Annotated[
         float,
         Field(
-            ge=0, le=10, description="The limit above never falls below this: noise of Lucas-Kanade at any size."
+            ge=0,
+            le=10,
+            description="The limit above never falls below this: noise of Lucas-Kanade at any size.",
         ),
     ] = 0.4
     rotation_check: Annotated[
@@ -180,7 +181,9 @@ class DetectorParams(BaseModel):
     ] = 300
     seed: Annotated[
         int,
-        Field(ge=0, le=2**32 - 1, description="Seed of the k-means starts. Same input, same seed: same answer."),
+        Field(
+            ge=0, le=2**32 - 1, description="Seed of the k-means starts. Same input, same seed: same answer."
+        ),
     ] = 0
     nearest_step: Annotated[
         int, Field(ge=1, le=1000, description="k = step * i nearest neighbours (2.2: k = 5 i).")
@@ -223,10 +226,12 @@ class DetectorParams(BaseModel):
 
     # ------------------------------------------------------------------ 2.3 vanishing points
     edge_low: Annotated[
-        float, Field(gt=0, le=10, description="Lower Canny threshold over the median grey (2.3; notebook: 0.67).")
+        float,
+        Field(gt=0, le=10, description="Lower Canny threshold over the median grey (2.3; notebook: 0.67)."),
     ] = 0.67
     edge_high: Annotated[
-        float, Field(gt=0, le=10, description="Upper Canny threshold over the median grey (2.3; notebook: 1.33).")
+        float,
+        Field(gt=0, le=10, description="Upper Canny threshold over the median grey (2.3; notebook: 1.33)."),
     ] = 1.33
     hough_votes_at_1280: Annotated[
         float, Field(ge=1, le=10_000, description="Votes that a line needs (2.3; notebook: 100).")
@@ -246,19 +251,24 @@ class DetectorParams(BaseModel):
         ),
     ] = 0
     line_angle_min_deg: Annotated[
-        float, Field(ge=0, lt=180, description="Lines with a greater angle to the horizontal count (2.3: 40).")
+        float,
+        Field(ge=0, lt=180, description="Lines with a greater angle to the horizontal count (2.3: 40)."),
     ] = 40.0
     line_angle_max_deg: Annotated[
-        float, Field(gt=0, le=180, description="Lines with a smaller angle to the horizontal count (2.3: 140).")
+        float,
+        Field(gt=0, le=180, description="Lines with a smaller angle to the horizontal count (2.3: 140)."),
     ] = 140.0
     vertical_gap_deg: Annotated[
         float,
         Field(
-            ge=0, lt=90, description="Drop lines this near to vertical (notebook: 10); 0 keeps them, as printed."
+            ge=0,
+            lt=90,
+            description="Drop lines this near to vertical (notebook: 10); 0 keeps them, as printed.",
         ),
     ] = 0.0
     pair_angle_min_deg: Annotated[
-        float, Field(ge=0, lt=90, description="Two lines intersect from this difference of angle on (2.3: 5).")
+        float,
+        Field(ge=0, lt=90, description="Two lines intersect from this difference of angle on (2.3: 5)."),
     ] = 5.0
     pair_angle_max_deg: Annotated[
         float, Field(gt=0, le=90, description="... and up to this one (2.3: 15).")
@@ -266,7 +276,9 @@ class DetectorParams(BaseModel):
     cell_px: Annotated[
         float,
         Field(
-            ge=1, le=200, description="Side of a cell of the intersection histogram, at any image size (2.3, eq. 1: 10)."
+            ge=1,
+            le=200,
+            description="Side of a cell of the intersection histogram, at any image size (2.3, eq. 1: 10).",
         ),
     ] = 10.0
 

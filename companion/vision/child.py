@@ -22,7 +22,7 @@ from companion.guidance.observation import BearingRange, DetectionReport, Pose
 from detector.camera_model import CameraError, CameraModel
 from detector.observer import CameraPose, MetricRange, Observation, VoidObserver
 from detector.params import DetectorParams, ParamsError
-from detector.results import Direction, NoDetection, NoDetectionReason, SinglePlane
+from detector.results import Direction, NoDetection, NoDetectionReason, SinglePlane, TimeToContact
 
 Vector = NDArray[np.float64]
 
@@ -137,23 +137,23 @@ class VoidPipeline:
         kind, reason, detail = "none", "", ""
         point_px: tuple[float, float] | None = None
         ray_body: tuple[float, float, float] | None = None
-        along: MetricRange | None = None
-        contact_frames: float | None = None
+        distance_m: float | None = None
+        spread_m: float | None = None
+        contact: TimeToContact | None = None
         match observation.detection:
             case Direction(x_px, y_px, direction_kind, contact):
                 kind, point_px = direction_kind.value, (float(x_px), float(y_px))
                 ray = model.pixel_to_ray([point_px])[0]
                 if np.isfinite(ray).all():
                     ray_body = _as_floats(self._r_body_from_camera @ ray)
-                    along = observation.range_along(ray)
-                contact_frames = None if contact is None else float(contact.frames)
+                    distance_m, spread_m = _free_range_m(observation, ray)
             case SinglePlane(contact):
                 kind = "single_plane"
-                along = observation.range_along(_level_axis(r_ned_from_camera))
-                contact_frames = None if contact is None else float(contact.frames)
+                distance_m, spread_m = plane_range_m(observation, contact, model)
+                if distance_m is None:
+                    distance_m, spread_m = _free_range_m(observation, _level_axis(r_ned_from_camera))
             case NoDetection(no_reason, detail):
                 reason = no_reason.value
-        known = along if along is not None and _is_usable(along) else None
         return DetectionReport(
             frame.seq,
             frame.time_ns,
@@ -165,9 +165,9 @@ class VoidPipeline:
             ray_body=ray_body,
             pose=pose,
             baseline_m=_finite_or_none(observation.baseline_m),
-            time_to_contact_frames=_finite_or_none(contact_frames),
-            distance_m=None if known is None else float(known.distance_m),
-            distance_spread_m=None if known is None else float(known.spread_m),
+            time_to_contact_frames=None if contact is None else _finite_or_none(contact.frames),
+            distance_m=distance_m,
+            distance_spread_m=spread_m,
             bearings=() if r_ned_from_camera is None else _bearings(observation, model, r_ned_from_camera),
             detector_s=time.perf_counter() - began_s,
         )
@@ -216,6 +216,34 @@ def _bearings(
                 BearingRange(azimuth_rad, float(along.distance_m), float(along.spread_m), along.samples)
             )
     return tuple(found)
+
+
+def _free_range_m(observation: Observation, ray: Vector) -> tuple[float | None, float | None]:
+    """Return the free distance along a ray of the camera and its spread, where they are known."""
+    along = observation.range_along(ray)
+    if along is None or not _is_usable(along):
+        return None, None
+    return float(along.distance_m), float(along.spread_m)
+
+
+def plane_range_m(
+    observation: Observation, contact: TimeToContact | None, model: CameraModel
+) -> tuple[float | None, float | None]:
+    """Return the distance of a plane along the camera's axis and its spread (m), where they are known.
+
+    Time to contact is depth over the step along the axis, so the step along the axis gives it its metres. It is used
+    before the free range, which near the focus of expansion is no more than a careful lower bound.
+    """
+    baseline_m = observation.baseline_m
+    if contact is None or baseline_m is None:
+        return None, None
+    step_m = baseline_m
+    if observation.focus_px is not None:
+        step_m *= float(model.pixel_to_ray([observation.focus_px])[0][2])  # the focus is where the step leads
+    distance_m, spread_m = contact.frames * step_m, contact.spread_frames * step_m
+    if not (math.isfinite(distance_m) and distance_m > 0 and math.isfinite(spread_m)):
+        return None, None
+    return float(distance_m), float(spread_m)
 
 
 def _level_axis(r_ned_from_camera: Vector | None) -> Vector:

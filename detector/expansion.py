@@ -38,6 +38,7 @@ _RESOLVED_SHARE: Final = 0.35  # of the range: a sample less sure than this has 
 _KNOWN_HALF_ANGLE_RAD: Final = math.radians(4.0)
 _KNOWN_SAMPLES: Final = 3
 _HIT_SAMPLES: Final = 3
+_ONE_SURFACE_SCATTER: Final = 1.6  # times the noise: beyond it the samples see several depths
 _HIT_SHARE: Final = 0.10
 
 
@@ -59,6 +60,47 @@ class MetricRange:
     distance_m: float
     spread_m: float
     samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class RangeSamples:
+    """Triangulated tracks. Parallax measures the inverse of the range, so that is what is kept: it has a normal error, and zero means far.
+
+    Attributes
+    ----------
+    rays
+        (N, 3) unit vectors in the later camera frame.
+    inverse_per_m, sigma_per_m
+        (N,) inverse range, which noise may make negative, and its standard deviation.
+    """
+
+    rays: NDArray[np.float64]
+    inverse_per_m: NDArray[np.float64]
+    sigma_per_m: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        n = len(self.rays)
+        if self.rays.shape != (n, 3) or self.inverse_per_m.shape != (n,) or self.sigma_per_m.shape != (n,):
+            raise ValueError(
+                f"expected (N, 3), (N,) and (N,), got {self.rays.shape}, {self.inverse_per_m.shape}, {self.sigma_per_m.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    @property
+    def is_resolved(self) -> NDArray[np.bool_]:
+        """(N,) whether the range is known to 35 %."""
+        resolved: NDArray[np.bool_] = self.sigma_per_m <= _RESOLVED_SHARE * self.inverse_per_m
+        return resolved
+
+    @property
+    def points_m(self) -> NDArray[np.float64]:
+        """(N, 3) in the later camera frame; NaN where the range is not resolved."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            points: NDArray[np.float64] = self.rays / self.inverse_per_m[:, None]
+        points[~self.is_resolved] = np.nan
+        return points
 
 
 def ideal_px(camera: CameraModel, points_px: ArrayLike) -> NDArray[np.float64]:
@@ -127,7 +169,7 @@ def fit_focus_of_expansion(
     """
     start, end = _tracks(start_px, end_px)
     flow = end - start
-    sigma = math.sqrt(2.0) * flow_sigma_px  # across the flow, both ends are noisy
+    sigma = flow_sigma_px
     moving = np.linalg.norm(flow, axis=1) > 2.0 * sigma
     if int(moving.sum()) < _MIN_TRACKS:
         return None
@@ -195,7 +237,7 @@ def time_to_contact_along(
     """
     start, end = _tracks(start_px, end_px)
     focus, towards = np.asarray(focus_px, dtype=np.float64), np.asarray(towards_px, dtype=np.float64)
-    sigma = math.sqrt(2.0) * flow_sigma_px
+    sigma = flow_sigma_px
     offset = start - focus
     radius = np.linalg.norm(offset, axis=1)
     near_direction = np.linalg.norm(end - towards, axis=1) <= gate_px
@@ -256,7 +298,7 @@ def refine_rotation(
     """
     a, b = camera.pixel_to_ray(start_px), camera.pixel_to_ray(end_px)
     translation = _vector(translation_later)
-    sigma = math.sqrt(2.0) * flow_sigma_px / camera.fx_px
+    sigma = flow_sigma_px / camera.fx_px
     rotation = np.eye(3)
     for _ in range(8):
         turned = a @ rotation.T
@@ -292,7 +334,7 @@ def ranges_m(
     *,
     later_from_start: ArrayLike | None = None,
     flow_sigma_px: float = FLOW_SIGMA_PX,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> RangeSamples:
     """Triangulate tracks with the known translation; forward, sideways or backward, all the same.
 
     Parameters
@@ -308,37 +350,29 @@ def ranges_m(
 
     Returns
     -------
-    Points (N, 3) in the later camera frame and the standard deviation (N,) of their ranges, m. A point without resolvable
-    parallax is put where its parallax would equal the noise, with a deviation as large as its range: only "farther than a fraction of that" is known of it. NaN where a track does not
-    fit the motion (a moving object, a bad track) or lies on the focus.
+    The samples, from the later camera; without the tracks that do not fit the motion (a moving object, a bad track)
+    or lie on the focus.
     """
     a, b = camera.pixel_to_ray(start_px), camera.pixel_to_ray(end_px)
     if later_from_start is not None:
         a = a @ np.asarray(later_from_start, dtype=np.float64).T
     translation = _vector(translation_later_m)
-    sigma = math.sqrt(2.0) * flow_sigma_px / camera.fx_px
+    sigma = flow_sigma_px / camera.fx_px
     # The earlier camera stands at -t. A point at b * range is seen from there along a: a x (b range + t) = 0.
     baseline = np.cross(translation, a)
     reach_m = np.linalg.norm(baseline, axis=1)  # of the baseline, across the line of sight
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = baseline / reach_m[:, None]
-        turn = np.cross(a, b)
-        parallax = np.einsum("ij,ij->i", turn, plane)
+        parallax = np.einsum("ij,ij->i", np.cross(a, b), plane)
         across = np.abs(np.einsum("ij,ij->i", b, plane))
         inverse, inverse_sigma = parallax / reach_m, sigma / reach_m
-        range_m = 1.0 / np.maximum(inverse, inverse_sigma)
-        sigma_m = range_m**2 * inverse_sigma
-        bad = (across > 3.0 * sigma + 0.25 * np.abs(parallax)) | (parallax < -3.0 * sigma)
-        bad |= ~np.isfinite(range_m) | (reach_m <= 1e-6)
-    points = b * range_m[:, None]
-    points[bad] = np.nan
-    sigma_m[bad] = np.nan
-    return points, sigma_m
+    fits = (across <= 3.0 * sigma + 0.25 * np.abs(parallax)) & (parallax >= -3.0 * sigma)
+    fits &= np.isfinite(inverse) & (reach_m > 1e-6)
+    return RangeSamples(b[fits], inverse[fits], inverse_sigma[fits])
 
 
 def free_range_along(
-    points_m: ArrayLike,
-    sigma_m: ArrayLike,
+    samples: RangeSamples,
     ray_camera: ArrayLike,
     *,
     half_width_m: float,
@@ -348,14 +382,14 @@ def free_range_along(
     """Return how far the vehicle could move along a ray before it meets something that was seen.
 
     Its cross section is swept along the ray; the first place where three points inside agree within 10 % is a surface. Unknown is
-    never free: without three samples within 4 degrees of the ray there is no answer, and where nothing is met, the answer ends
-    at what those samples show themselves. A sample that is less sure than 35 % of its range vouches only for its
-    lower bound (two standard deviations of its parallax), and is not taken for an obstacle.
+    never free: without three samples within 4 degrees of the ray there is no answer, and where nothing is met, the answer ends at
+    what those samples vouch for together: their common inverse range with two standard deviations on the near side,
+    or their near quartile where they do not agree on one. A sample that is less sure than 35 % of its range is not taken for an obstacle by itself.
 
     Parameters
     ----------
-    points_m, sigma_m
-        (N, 3) and (N,) of :func:`ranges_m`; NaN rows are left out.
+    samples
+        From :func:`ranges_m`.
     ray_camera
         (3,) the direction, any length.
     half_width_m, half_height_m
@@ -363,11 +397,6 @@ def free_range_along(
     up_camera
         (3,) up, in the camera's axes; (0, -1, 0) when not given, which is right for a level camera.
     """
-    points, sigma = np.asarray(points_m, dtype=np.float64), np.asarray(sigma_m, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or sigma.shape != (len(points),):
-        raise ValueError(f"expected points (N, 3) and sigma (N,), got {points.shape} and {sigma.shape}")
-    finite = np.isfinite(points).all(axis=1) & np.isfinite(sigma)
-    points, sigma = points[finite], sigma[finite]
     ray = _vector(ray_camera)
     ray = ray / np.linalg.norm(ray)
     up = np.array([0.0, -1.0, 0.0]) if up_camera is None else _vector(up_camera)
@@ -377,40 +406,43 @@ def free_range_along(
     side /= np.linalg.norm(side)
     vertical = np.cross(side, ray)
 
-    range_m = np.linalg.norm(points, axis=1)
-    along_m = points @ ray
-    resolved = sigma <= _RESOLVED_SHARE * range_m
-    # One standard deviation of parallax is sigma / range^2 of inverse range; two of them nearer is the lower bound.
-    vouched_share = np.where(resolved, 1.0, range_m / (range_m + 2.0 * sigma))
-    near_ray = along_m > math.cos(_KNOWN_HALF_ANGLE_RAD) * range_m
+    near_ray = samples.rays @ ray > math.cos(_KNOWN_HALF_ANGLE_RAD)
     if int(near_ray.sum()) < _KNOWN_SAMPLES:
         return None
-    vouched_m = np.sort((along_m * vouched_share)[near_ray])
-    index = min(len(vouched_m) - 1, max(_KNOWN_SAMPLES - 1, len(vouched_m) // 4))
-    distance_m, spread_m, samples = (
-        float(vouched_m[index]),
-        _spread(vouched_m, sigma[near_ray]),
-        len(vouched_m),
-    )
+    vouched = _vouched(samples.inverse_per_m[near_ray], samples.sigma_per_m[near_ray])
 
-    inside = resolved & (along_m > 0.0)
-    inside &= (np.abs(points @ side) <= half_width_m) & (np.abs(points @ vertical) <= half_height_m)
+    points_m = samples.points_m
+    along_m = points_m @ ray
+    inside = samples.is_resolved & (along_m > 0.0)
+    inside &= (np.abs(points_m @ side) <= half_width_m) & (np.abs(points_m @ vertical) <= half_height_m)
     hits_m = np.sort(along_m[inside])
     triples = np.flatnonzero(hits_m[_HIT_SAMPLES - 1 :] <= (1.0 + _HIT_SHARE) * hits_m[: 1 - _HIT_SAMPLES])
-    if triples.size:
-        hit_m = float(hits_m[triples[0] + 1])
-        if hit_m < distance_m:
-            of_surface = inside & (np.abs(along_m - hit_m) <= 2.0 * _HIT_SHARE * hit_m)
-            distance_m = hit_m
-            spread_m = _spread(along_m[of_surface], sigma[of_surface])
-            samples = int(of_surface.sum())
-    return MetricRange(distance_m=distance_m, spread_m=spread_m, samples=samples)
+    if triples.size == 0 or hits_m[triples[0] + 1] >= vouched.distance_m:
+        return vouched
+    hit_m = float(hits_m[triples[0] + 1])
+    of_surface = inside & (np.abs(along_m - hit_m) <= 2.0 * _HIT_SHARE * hit_m)
+    surface_m = along_m[of_surface]
+    scatter_m = 1.4826 * float(np.median(np.abs(surface_m - np.median(surface_m))))
+    single_m = float(np.median(samples.sigma_per_m[of_surface])) * hit_m**2
+    return MetricRange(hit_m, max(scatter_m, single_m / math.sqrt(surface_m.size)), int(surface_m.size))
 
 
-def _spread(values: NDArray[np.float64], sigma: NDArray[np.float64]) -> float:
-    """Robust standard deviation of the values, at least what their own uncertainty leaves of their mean."""
-    deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
-    return max(deviation, float(np.median(sigma)) / math.sqrt(len(values)))
+def _vouched(inverse: NDArray[np.float64], sigma: NDArray[np.float64]) -> MetricRange:
+    """Return the distance that samples about one direction vouch for."""
+    weight = 1.0 / sigma**2
+    pooled_sigma = 1.0 / math.sqrt(float(weight.sum()))
+    middle = _weighted_quantile(inverse, weight, 0.5)
+    scatter = float(np.median(np.abs(inverse - middle) / sigma)) / 0.6745
+    if scatter <= _ONE_SURFACE_SCATTER:
+        agreeing = np.abs(inverse - middle) <= 3.0 * max(1.0, scatter) * sigma
+        mean = float((weight * inverse)[agreeing].sum() / weight[agreeing].sum())
+        pooled_sigma *= max(1.0, scatter)
+        near = max(mean, middle) + 2.0 * pooled_sigma
+    else:
+        near = max(_weighted_quantile(inverse, weight, 0.75), float(np.quantile(inverse, 0.75)))
+        pooled_sigma *= scatter
+    near = max(near, 2.0 * pooled_sigma)  # no farther than the parallax can resolve
+    return MetricRange(1.0 / near, pooled_sigma / near**2, inverse.size)
 
 
 def _best_hypothesis(

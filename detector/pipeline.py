@@ -100,12 +100,16 @@ class VoidDetector:
         All settings.
     timer
         Gives seconds, for the time of each step; the machine's performance counter by default.
+    starts
+        Initial centres of k-means; drawn from the parameters' seed by default.
     """
 
-    def __init__(self, params: DetectorParams, *, timer: Timer | None = None) -> None:
+    def __init__(
+        self, params: DetectorParams, *, timer: Timer | None = None, starts: clusters.Starts | None = None
+    ) -> None:
         self.params = params
         self._timer: Timer = time.perf_counter if timer is None else timer
-        self._starts = clusters.seeded_starts(params.seed, params.kmeans_restarts)
+        self._starts = starts or clusters.seeded_starts(params.seed, params.kmeans_restarts)
         self._p: int | None = None
         self._n: int | None = None
         self._k: int | None = None

@@ -1,0 +1,1 @@
+"""A slow, literal transcription of the paper: the oracle of the detector's tests."""

@@ -156,7 +156,7 @@ class DetectorConfig(_Section):
             le=60,
             description="A pair that takes longer counts as hung: the worker is killed and restarted.",
         ),
-    ] = 3.0
+    ] = 10.0
     start_timeout_s: Annotated[
         float, Field(gt=0, le=300, description="Time allowed for the worker to start (imports included).")
     ] = 60.0
@@ -292,7 +292,7 @@ class GuidanceConfig(_Section):
     wall_n: Annotated[int, Field(ge=1, le=20, description="Window of answers that wall_k counts in.")] = 3
     wall_limit_m: Annotated[
         float, Field(gt=0, le=50, description="A plane further away than this is not a wall yet (m).")
-    ] = 3.0
+    ] = 2.0
     wall_margin_m: Annotated[
         float,
         Field(
@@ -376,7 +376,7 @@ class GuidanceConfig(_Section):
             le=60,
             description="No report of any kind from the worker for this long: vision counts as dead (s).",
         ),
-    ] = 1.5
+    ] = 2.0
     pose_max_age_s: Annotated[float, Field(gt=0, le=5, description="Greatest age of the pose (s).")] = 0.5
     planner_timeout_s: Annotated[
         float, Field(gt=0, le=60, description="Silence after which the planner's goal is forgotten (s).")

@@ -23,6 +23,7 @@ from typing import Any, Final
 from companion.clock import Clock
 from companion.config import Config
 from companion.errors import SourceError
+from companion.frames.file import FileSource
 from companion.frames.open import open_source
 from companion.guidance.observation import DetectionReport
 from companion.interception import Interception
@@ -126,10 +127,12 @@ class Service:
                 source = open_source(config, clock=clock, log=log)
                 async with source:
                     log.info("source_opened", kind=config.kind)
+                    if config.kind == "file":
+                        await vision.wait_ready()  # so that nothing of a recording is lost
                     async for frame in source.frames():
                         now_ns = clock.now_ns()
-                        if self._last_frame_ns is None and config.kind == "file":
-                            log.info("source_started", started_ns=frame.time_ns)
+                        if self._last_frame_ns is None and isinstance(source, FileSource):
+                            log.info("source_started", started_ns=source.started_ns)
                         self._last_frame_ns = now_ns
                         self._source_fault = None
                         failures = 0

@@ -279,6 +279,15 @@ def frame_bytes(image: NDArray[np.uint8], *, seq: int, time_ns: int) -> bytes:
         Number of the frame, modulo 2^32.
     time_ns
         CLOCK_MONOTONIC of the exposure.
+
+    Raises
+    ------
+    ValueError
+        When the image is not such a grey image.
     """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise ValueError(f"expected an (H, W) uint8 image, got {image.shape} {image.dtype}")
     height_px, width_px = image.shape
+    if not (1 <= width_px <= MAX_SIDE_PX and 1 <= height_px <= MAX_SIDE_PX):
+        raise ValueError(f"expected sides of 1 to {MAX_SIDE_PX} px, got {width_px} x {height_px}")
     return FrameHeader(width_px, height_px, seq % (1 << 32), time_ns).pack() + image.tobytes()

@@ -174,7 +174,7 @@ async def _footage(output: Path, display: Display) -> Part:
             FakeAutopilot(to_autopilot, replay=poses, keep_frames=True) as autopilot,
             Planner(to_planner, rate_hz=_PLANNER_HZ, keep_frames=True) as planner,
         ):
-            await _start(planner, _ahead(poses, 0.0))
+            joined = await _start(planner, autopilot, _ahead(poses, 0.0))
             started_ns = int((await service.wait_for("source_started", _WORKER_START_S))["started_ns"])
             video.started_ns = started_ns
             autopilot.start_replay(started_ns)
@@ -183,7 +183,7 @@ async def _footage(output: Path, display: Display) -> Part:
                 planner.aim(_ahead(poses, elapsed_s))
                 await clock.sleep_until_ns(started_ns + round((elapsed_s + _AIM_EVERY_S) * 1e9))
                 elapsed_s = (clock.now_ns() - started_ns) / 1e9
-            await _finish(part, service, autopilot, planner)
+            await _finish(part, service, autopilot, planner, joined)
     part.outcome = "the recording was played to its end"
     display.say("writing the annotated video")
     part.video = await asyncio.to_thread(video.write)
@@ -221,7 +221,7 @@ async def _room(output: Path, display: Display) -> Part:
         to_planner, _ = await _addresses(service)
         planner = await stack.enter_async_context(Planner(to_planner, rate_hz=_PLANNER_HZ, keep_frames=True))
         await service.wait_for("worker_ready", _WORKER_START_S)
-        await _start(planner, _ROOM_GOAL)
+        joined = await _start(planner, autopilot, _ROOM_GOAL)
         begin_ns = clock.now_ns()
         closest_m = math.inf
         outcome = "time was up"
@@ -235,7 +235,7 @@ async def _room(output: Path, display: Display) -> Part:
                 break
             await clock.sleep_until_ns(clock.now_ns() + 50_000_000)
         part.outcome = f"{outcome}, never nearer than {closest_m:.1f} m to a wall"
-        await _finish(part, service, autopilot, planner)
+        await _finish(part, service, autopilot, planner, joined)
     display.say("writing the annotated video")
     part.video = await asyncio.to_thread(video.write)
     return part
@@ -251,22 +251,47 @@ async def _addresses(service: CompanionProcess) -> tuple[Address, Address]:
     return found[0], found[1]
 
 
-async def _start(planner: Planner, waypoint: Waypoint) -> None:
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """Frames sent by each end before both were known to the service: nobody could receive them yet."""
+
+    by_planner: int
+    by_autopilot: int
+
+
+async def _start(planner: Planner, autopilot: FakeAutopilot, waypoint: Waypoint) -> Joined:
     """Arm and enter OFFBOARD with setpoints that are streamed already."""
     await planner.wait_ready()
+    joined = Joined(len(planner.sent_frames), len(autopilot.sent_frames))
     planner.aim(waypoint)
     await planner.arm()
     await planner.start_offboard()
+    return joined
 
 
-async def _finish(part: Part, service: CompanionProcess, autopilot: FakeAutopilot, planner: Planner) -> None:
+async def _finish(
+    part: Part, service: CompanionProcess, autopilot: FakeAutopilot, planner: Planner, joined: Joined
+) -> None:
     """Stop the planner, let the last frames arrive, end the service, and compare both ends."""
     clock = RealClock()
     planner.stop_streaming()
     await clock.sleep_until_ns(clock.now_ns() + 200_000_000)
-    planner_sent, autopilot_sent = list(planner.sent_frames), list(autopilot.sent_frames)
+    planner_judged = slice(joined.by_planner, len(planner.sent_frames))
+    autopilot_judged = slice(joined.by_autopilot, len(autopilot.sent_frames))
     await clock.sleep_until_ns(clock.now_ns() + 300_000_000)
-    part.traffic = compare(planner_sent, autopilot.received_frames, autopilot_sent, planner.received_frames)
+    up, down = planner.sent_frames, autopilot.sent_frames
+    part.traffic = compare(
+        up[planner_judged],
+        autopilot.received_frames,
+        down[autopilot_judged],
+        planner.received_frames,
+        not_judged=[
+            *up[: planner_judged.start],
+            *up[planner_judged.stop :],
+            *down[: autopilot_judged.start],
+            *down[autopilot_judged.stop :],
+        ],
+    )
     code = await service.stop()
     summaries = service.of("summary")
     if code != 0 or not summaries:

@@ -1,14 +1,6 @@
 """Grey frames to anyone who connects by TCP. Newest wins: a slow reader misses frames and holds nobody up.
 
-Each frame is a header of 32 bytes, little-endian, and the pixels, row by row::
-
-    magic    4 bytes  b"VCF1"
-    width    u16      px
-    height   u16      px
-    seq      u32      number of the frame, from 0
-    time_ns  u64      CLOCK_MONOTONIC of the exposure
-    reserved u64      0
-    payload  u32      bytes that follow: width x height
+The format of a frame is :func:`companion.frames.socket.frame_bytes`.
 """
 
 from __future__ import annotations
@@ -16,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-import struct
 from types import TracebackType
 from typing import Self
 
@@ -24,38 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import LinkError
+from companion.frames.socket import frame_bytes
 
 Address = tuple[str, int]
 
-HEADER = struct.Struct("<4sHHIQQI")
-MAGIC = b"VCF1"
 _SEND_BUFFER_BYTES = 32_768
 """Small, so that a slow reader's next frame is a new one, not one that has waited in the kernel."""
-
-
-def encode_frame(image: NDArray[np.uint8], seq: int, time_ns: int) -> bytes:
-    """Return header and pixels of one frame.
-
-    Parameters
-    ----------
-    image
-        (H, W), grey.
-    seq
-        Number of the frame; wraps at 2**32.
-    time_ns
-        CLOCK_MONOTONIC of the exposure.
-
-    Raises
-    ------
-    ValueError
-        When the image is not a grey image of 1 to 65535 px a side.
-    """
-    if image.ndim != 2 or image.dtype != np.uint8:
-        raise ValueError(f"expected an (H, W) uint8 image, got {image.shape} {image.dtype}")
-    height, width = image.shape
-    if not (1 <= width <= 0xFFFF and 1 <= height <= 0xFFFF):
-        raise ValueError(f"expected 1 to 65535 px a side, got {width} x {height}")
-    return HEADER.pack(MAGIC, width, height, seq & 0xFFFFFFFF, time_ns, 0, width * height) + image.tobytes()
 
 
 class FrameServer:
@@ -120,7 +85,7 @@ class FrameServer:
         ValueError
             When the image is not a grey image.
         """
-        self._newest = encode_frame(image, self.frames_published, time_ns)
+        self._newest = frame_bytes(image, seq=self.frames_published, time_ns=time_ns)
         self.frames_published += 1
         self._published.set()
         self._published = asyncio.Event()

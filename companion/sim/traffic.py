@@ -44,17 +44,29 @@ def compare(
     autopilot_received: Iterable[bytes],
     autopilot_sent: Iterable[bytes],
     planner_received: Iterable[bytes],
+    *,
+    not_judged: Iterable[bytes] = (),
 ) -> Comparison:
     """Compare what left each end with what reached the other; frames as bytes, in order.
 
     Frames of other senders (the companion's own HEARTBEAT and STATUSTEXT) are left out of what was received.
+
+    Parameters
+    ----------
+    planner_sent, autopilot_sent
+        From when both ends were joined, up to a moment that lies long enough back for all of it to have arrived.
+    autopilot_received, planner_received
+        Up to now.
+    not_judged
+        What left either end before or after: it may have arrived, and nothing is lost where it has not.
     """
+    unjudged = Counter(frame.data for frame in _frames(not_judged))
     up_sent, up_received = _frames(planner_sent), _frames(autopilot_received)
     sent = [frame for frame in up_sent if frame.message_id == _SETPOINT]
     received = [frame for frame in up_received if frame.message_id == _SETPOINT]
     lost, z_changed = _match_setpoints(sent, received)
-    up = _match_others(up_sent, up_received)
-    down = _match_others(_frames(autopilot_sent), _frames(planner_received))
+    up = _match_others(up_sent, up_received, unjudged)
+    down = _match_others(_frames(autopilot_sent), _frames(planner_received), unjudged)
     return Comparison(
         setpoints_sent=len(sent),
         setpoints_received=len(received),
@@ -93,7 +105,10 @@ def _match_setpoints(sent: Sequence[RawFrame], received: Sequence[RawFrame]) -> 
     return lost, z_changed + len(received) - position
 
 
-def _match_others(sent: Sequence[RawFrame], received: Sequence[RawFrame]) -> tuple[int, int, int]:
+def _match_others(
+    sent: Sequence[RawFrame], received: Sequence[RawFrame], unjudged: Counter[bytes]
+) -> tuple[int, int, int]:
+    """Return how many were sent, how many of them are missing, and how many arrived that nobody sent like that."""
     senders = {(frame.system_id, frame.component_id) for frame in sent}
     out = Counter(frame.data for frame in sent if frame.message_id != _SETPOINT)
     back = Counter(
@@ -102,6 +117,5 @@ def _match_others(sent: Sequence[RawFrame], received: Sequence[RawFrame]) -> tup
         if frame.message_id != _SETPOINT and (frame.system_id, frame.component_id) in senders
     )
     missing = sum((out - back).values())
-    strange = sum((back - out).values())
-    altered = min(missing, strange)
-    return sum(out.values()), missing - altered, strange
+    strange = sum((back - out - unjudged).values())
+    return sum(out.values()), max(0, missing - strange), strange

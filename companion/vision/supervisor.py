@@ -122,6 +122,7 @@ class VisionSupervisor:
         self._waiting: Detect | None = None
         self._in_flight: Detect | None = None
         self._life: _Life | None = None
+        self._was_ready = asyncio.Event()
 
     @property
     def status(self) -> WorkerStatus:
@@ -200,8 +201,18 @@ class VisionSupervisor:
             case _:
                 raise WorkerError(f"the vision worker cannot be started: {life.cause_of(message)}")
 
+    async def wait_ready(self) -> None:
+        """Wait until a worker has been ready for the first time."""
+        await self._was_ready.wait()
+
     async def run(self) -> None:
-        """Keep a worker running until cancelled; the process is gone when this returns."""
+        """Keep a worker running until cancelled; the process is gone when this returns.
+
+        Raises
+        ------
+        companion.errors.ConfigError
+            When the first worker says that the camera file or the detector's parameters cannot be used.
+        """
         backoff = RestartBackoff(self._detector.restart_delay_s, self._detector.restart_delay_max_s)
         try:
             async with _WorkerThread() as thread:
@@ -249,6 +260,7 @@ class VisionSupervisor:
                 case Ready() if self._state == "starting":
                     life.disarm()
                     self._state = "ready"
+                    self._was_ready.set()
                     self._log.info(
                         "worker_ready", pid=life.pid, start_s=(self._clock.now_ns() - started_ns) / 1e9
                     )
@@ -259,6 +271,8 @@ class VisionSupervisor:
                     self._state = "ready"
                     self._last_report_ns = self._clock.now_ns()
                     self._on_report(message.report)
+                case Unusable() if not self._was_ready.is_set():
+                    raise ConfigError(message.message)  # it never worked, and no restart will mend a file
                 case Failed():
                     return _Death(message.error, {"traceback": message.traceback}, _GRACE_S)
                 case _Overrun() if not life.is_overrun(message):

@@ -120,7 +120,7 @@ def test_silence_of_the_worker_is_noticed_without_being_told():
     flight = Flight(HALL)
     flight.fly(setpoint(8, 0), 5)
     flight.camera_alive = False
-    flight.fly(setpoint(8, 0), 2)
+    flight.fly(setpoint(8, 0), 2.5)
     assert (flight.state, flight.switch.reason) == (State.HOLD, "vision silent")
 
 

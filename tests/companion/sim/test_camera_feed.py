@@ -12,10 +12,11 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from companion.errors import LinkError, SourceError
+from companion.frames.socket import frame_bytes
 from companion.guidance.coordinates import quaternion_from_euler
 from companion.guidance.observation import Pose
 from companion.sim.camera_feed import CameraFeed, CameraMount
-from companion.sim.frame_server import FrameServer, encode_frame
+from companion.sim.frame_server import FrameServer
 from companion.sim.scene import empty_room
 from detector.camera_model import CameraModel
 
@@ -33,12 +34,12 @@ async def read_frame(reader: asyncio.StreamReader) -> tuple[NDArray[np.uint8], i
 
 def test_a_frame_on_the_wire_is_header_and_rows() -> None:
     image = np.arange(6, dtype=np.uint8).reshape(2, 3)
-    data = encode_frame(image, 7, 123456789)
+    data = frame_bytes(image, seq=7, time_ns=123456789)
     assert data[:4] == b"VCF1"
     assert struct.unpack("<HHIQQI", data[4:32]) == (3, 2, 7, 123456789, 0, 6)
     assert data[32:] == bytes(range(6))
     sliced = np.arange(24, dtype=np.uint8).reshape(4, 6)[::2, ::2]
-    assert encode_frame(sliced, 0, 0)[32:] == sliced.tobytes()
+    assert frame_bytes(sliced, seq=0, time_ns=0)[32:] == sliced.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,7 @@ def test_a_frame_on_the_wire_is_header_and_rows() -> None:
 )
 def test_only_grey_images_of_a_sensible_size_are_frames(image: NDArray[np.uint8]) -> None:
     with pytest.raises(ValueError, match="expected"):
-        encode_frame(image, 0, 0)
+        frame_bytes(image, seq=0, time_ns=0)
 
 
 async def test_two_readers_get_the_frames_from_when_they_came() -> None:

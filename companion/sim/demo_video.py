@@ -162,7 +162,11 @@ def _draw_answer(view: Image, event: Event, age_ns: int, scale: float) -> None:
 def _text(
     image: Image, words: str, place: tuple[int, int], size: float, colour: Colour, thickness: int = 1
 ) -> None:
-    cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), thickness + 2, cv2.LINE_AA)
+    # The outline is the same text, moved: a thicker one would be wider since OpenCV 5.
+    x, y = place
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        at = (x + dx, y + dy)
+        cv2.putText(image, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), thickness, cv2.LINE_AA)
     cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thickness, cv2.LINE_AA)
 
 

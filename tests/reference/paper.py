@@ -143,7 +143,10 @@ def void_of_pair(
     # 2.4: the candidate nearest to the LMCC, if the flow there is as low.
     if answer.candidates_px:
         x, y = min(answer.candidates_px, key=lambda c: math.dist(c, lmcc))
-        if abs(_mean_of_nearest(x, y, vectors, answer.k) - lmcc_length) < settings.vote_tolerance * lmcc_length:
+        if (
+            abs(_mean_of_nearest(x, y, vectors, answer.k) - lmcc_length)
+            < settings.vote_tolerance * lmcc_length
+        ):
             answer.kind, answer.x_px, answer.y_px = "vanishing_point", x, y
             return answer
     answer.kind, (answer.x_px, answer.y_px) = "lowest_flow", lmcc

@@ -14,6 +14,7 @@ from detector.expansion import (
     focus_of_expansion_from_translation,
     free_range_along,
     ideal_px,
+    plane_share,
     ranges_m,
     refine_rotation,
     time_to_contact_along,
@@ -213,6 +214,24 @@ def test_an_error_of_the_attitude_is_found(translation: tuple[float, float, floa
         CAMERA, *_tracks(points, translation), translation, prior_sigma_rad=math.radians(0.3)
     )
     np.testing.assert_allclose(exact, np.eye(3), atol=1e-5)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5])
+def test_one_plane_explains_a_wall_and_not_a_room(slope: float) -> None:
+    rng = np.random.default_rng(6)
+    rays = _cloud(rng, 400, 1.0, 1.0)  # z = 1
+    wall = rays * (3.0 / (1.0 - slope * rays[:, :1]))
+    start, end = _tracks(wall, (0, 0, 0.25), 0.2)
+    share = plane_share(start, end, (319.5, 239.5))
+    assert share is not None
+    assert share > 0.93
+    floor = np.where(rays[:, 1:2] > 0.2, 1.0 / np.maximum(rays[:, 1:2], 0.2), 5.0)  # one metre below, to 5 m
+    side = np.where(np.abs(rays[:, :1]) > 0.25, 1.2 / np.maximum(np.abs(rays[:, :1]), 0.25), 5.0)
+    start, end = _tracks(rays * np.minimum(floor, side), (0, 0, 0.25), 0.2)
+    share = plane_share(start, end, (319.5, 239.5))
+    assert share is not None
+    assert share < 0.7
+    assert plane_share(start[:5], end[:5], (319.5, 239.5)) is None
 
 
 def _wall(

@@ -58,8 +58,11 @@ def _detect(
     )
 
 
-@pytest.mark.parametrize("angle_deg", [0.0, 15.0, 30.0])
-@pytest.mark.parametrize("distance_m", [1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+@pytest.mark.parametrize(
+    ("distance_m", "angle_deg"),
+    [(distance_m, 0.0) for distance_m in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)]
+    + [(distance_m, angle_deg) for angle_deg in (15.0, 30.0) for distance_m in (1.0, 3.0, 6.0)],
+)
 def test_a_wall_is_one_plane_and_its_time_to_contact_is_right(distance_m: float, angle_deg: float) -> None:
     scene = square_wall(distance_m + STEP_M, angle_deg, seed=1)
     found = _detect(scene, _pose(0, 0, 0), _pose(STEP_M, 0, 0)).detection
@@ -70,7 +73,7 @@ def test_a_wall_is_one_plane_and_its_time_to_contact_is_right(distance_m: float,
     assert lowest * distance_m / STEP_M < found.time_to_contact.frames < 1.2 * distance_m / STEP_M
 
 
-@pytest.mark.parametrize("distance_m", [2.0, 3.0, 4.0, 6.0])
+@pytest.mark.parametrize("distance_m", [2.0, 3.0, 6.0])
 def test_the_literal_method_calls_a_square_wall_a_wall_from_two_metres(distance_m: float) -> None:
     found = _detect(square_wall(distance_m + STEP_M, seed=1), _pose(0, 0, 0), _pose(STEP_M, 0, 0), "paper")
     assert isinstance(found.detection, SinglePlane)

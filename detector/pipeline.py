@@ -35,8 +35,9 @@ from detector.rotation import parallax_px
 
 Timer = Callable[[], float]
 
-_ASSUMED_HFOV_DEG: Final = 70.0
-"""Field of view taken for the check on pure rotation where no camera is known; a wrong one hardly matters there."""
+_ASSUMED_HFOVS_DEG: Final = range(45, 111, 5)
+"""Fields of view tried by the check on pure rotation where no camera is known: the one that explains most counts. Ten degrees
+beside the truth, a turn of 4 degrees leaves more flow behind than a camera's motion would."""
 _MIN_TRACKS: Final = 10
 """Fewer vectors than this say nothing about motion."""
 
@@ -290,8 +291,12 @@ class VoidDetector:
         if derotated or not params.rotation_check:
             return
         with notes.step("flow"):
-            judged = camera or CameraModel.from_hfov(width_px, height_px, _ASSUMED_HFOV_DEG)
-            left_px = parallax_px(judged, raw)
+            judged = (
+                [CameraModel.from_hfov(width_px, height_px, hfov_deg) for hfov_deg in _ASSUMED_HFOVS_DEG]
+                if camera is None
+                else [camera]
+            )
+            left_px = min(parallax_px(each, raw) for each in judged)
         limit_px = max(scaled_px(params.parallax_px_at_1280, width_px), params.still_flow_floor_px)
         if left_px < limit_px:
             raise _Stop(

@@ -45,7 +45,7 @@ def parallax_px(camera: Camera, tracks: Tracks, *, percentile: float = 80.0) -> 
     Parameters
     ----------
     camera
-        A rough field of view is enough: for small rotations a wrong focal length scales the angle, not the fit.
+        Its field of view matters: towards the borders a turn's flow grows with the square of the angle from the axis.
     tracks
         Before any rotation is taken out.
     percentile

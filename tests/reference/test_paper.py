@@ -82,7 +82,13 @@ def settings_of(params: DetectorParams) -> Settings:
 def params_of(preset: PresetName) -> DetectorParams:
     """Return a preset with what the oracle has no word for taken out."""
     return DetectorParams.preset(
-        preset, lines_wanted=0, rotation_check=False, depth_cue="flow", blur_limit=1.0, kmeans_restarts=2
+        preset,
+        plane_test="deviation_px" if preset == "paper" else "deviation_ratio",
+        lines_wanted=0,
+        rotation_check=False,
+        depth_cue="flow",
+        blur_limit=1.0,
+        kmeans_restarts=2,
     )
 
 

@@ -167,6 +167,26 @@ class DetectorConfig(_Section):
     restart_delay_max_s: Annotated[
         float, Field(gt=0, le=600, description="Longest delay between restarts.")
     ] = 5.0
+    vehicle_width_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=5,
+            description="Width swept along a direction to find its free distance, margins included (m). Larger: fewer ways count as free.",
+        ),
+    ] = 0.9
+    vehicle_height_m: Annotated[
+        float,
+        Field(gt=0, le=5, description="Height swept likewise, margins included (m)."),
+    ] = 0.4
+    baseline_m: Annotated[
+        float,
+        Field(
+            ge=0.02,
+            le=2,
+            description="Distance flown between the two frames of a pair that is aimed at (m); 0.4 to 1.8 times of it is taken. Larger: surer ranges, fewer tracks that survive.",
+        ),
+    ] = 0.25
     threads: Annotated[
         int,
         Field(

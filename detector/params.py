@@ -200,9 +200,9 @@ class DetectorParams(BaseModel):
 
     # ------------------------------------------------------------------ 2.2 single plane
     plane_test: Annotated[
-        Literal["deviation_px", "deviation_ratio"],
+        Literal["deviation_px", "deviation_ratio", "plane_share"],
         Field(
-            description="deviation_px: standard deviation of the centre magnitudes in px, as printed (2.2). deviation_ratio: that over their median, free of scale."
+            description="deviation_px: standard deviation of the centre magnitudes in px, as printed (2.2). deviation_ratio: that over their median, free of scale. plane_share: the share of the flow vectors that one plane explains, where the focus of expansion is known, else deviation_ratio."
         ),
     ] = "deviation_px"
     plane_deviation_px_at_1280: Annotated[
@@ -216,7 +216,15 @@ class DetectorParams(BaseModel):
     plane_ratio: Annotated[
         float,
         Field(gt=0, le=10, description="deviation_ratio: below this it is one plane. Larger: more planes."),
-    ] = 0.35
+    ] = 0.30
+    plane_share: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=1,
+            description="plane_share: from this share on it is one plane. Larger: fewer planes. Not in the paper.",
+        ),
+    ] = 0.9
     depth_cue: Annotated[
         Literal["flow", "inverse_contact"],
         Field(
@@ -367,7 +375,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "unique_locations": True,
         "lk_predict_rotation": True,
         "rotation_check": True,
-        "plane_test": "deviation_ratio",
+        "plane_test": "plane_share",
         "lines_wanted": 10,
     },
 }

@@ -338,11 +338,9 @@ class VoidDetector:
             centre_magnitudes = clusters.nearest_magnitudes(centres, kept.end_px, magnitudes, k)
             lowest = int(np.argmin(centre_magnitudes))
             lmcc, lmcc_magnitude = centres[lowest], float(centre_magnitudes[lowest])
-            if params.plane_test == "deviation_px":
-                statistic = clusters.plane_deviation(centre_magnitudes)
-                threshold = scaled_px(params.plane_deviation_px_at_1280, width_px)
-            else:
-                statistic, threshold = clusters.plane_ratio(centre_magnitudes), params.plane_ratio
+            is_plane, statistic, threshold = self._plane_test(
+                centre_magnitudes, tracks, focus, camera, width_px
+            )
         notes.fields.update(
             n=len(centres),
             k=k,
@@ -353,7 +351,7 @@ class VoidDetector:
             plane_statistic=statistic,
             plane_threshold=threshold,
         )
-        if statistic < threshold:
+        if is_plane:
             with notes.step("contact"):
                 # One plane: every vector of it says the same, so the whole view answers.
                 middle = np.array([0.5 * width_px, 0.5 * later.shape[0]])
@@ -371,6 +369,30 @@ class VoidDetector:
             contact = self._contact(tracks, focus, camera, at, gate_px=gate_px)
         kind = DirectionKind.LOWEST_FLOW if elected is None else DirectionKind.VANISHING_POINT
         return Direction(float(at[0]), float(at[1]), kind, contact, notes.diagnostics())
+
+    def _plane_test(
+        self,
+        centre_magnitudes: NDArray[np.float64],
+        tracks: Tracks,
+        focus: NDArray[np.float64] | None,
+        camera: CameraModel | None,
+        width_px: int,
+    ) -> tuple[bool, float, float]:
+        """Return whether the scene is one plane, and the two figures that were compared."""
+        params = self.params
+        if params.plane_test == "deviation_px":
+            deviation = clusters.plane_deviation(centre_magnitudes)
+            limit_px = scaled_px(params.plane_deviation_px_at_1280, width_px)
+            return deviation < limit_px, deviation, limit_px
+        if params.plane_test == "plane_share" and focus is not None:
+            start, end = tracks.start_px, tracks.end_px
+            if camera is not None:
+                start, end = expansion.ideal_px(camera, start), expansion.ideal_px(camera, end)
+            share = expansion.plane_share(start, end, focus)
+            if share is not None:
+                return share >= params.plane_share, share, params.plane_share
+        ratio = clusters.plane_ratio(centre_magnitudes)
+        return ratio < params.plane_ratio, ratio, params.plane_ratio
 
     def _cluster(self, kept: Tracks, magnitudes: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
         """Return the (n, 2) cluster centres in the image and k; n and k are chosen in the first loop."""

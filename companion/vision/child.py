@@ -20,7 +20,7 @@ from companion.frames.source import Frame
 from companion.guidance.coordinates import r_body_from_camera, r_ned_from_body, wrap_rad
 from companion.guidance.observation import BearingRange, DetectionReport, Pose
 from detector.camera_model import CameraError, CameraModel
-from detector.observer import CameraPose, MetricRange, Observation, VoidObserver
+from detector.observer import CameraPose, MetricRange, Observation, ObserverParams, VoidObserver
 from detector.params import DetectorParams, ParamsError
 from detector.results import Direction, NoDetection, NoDetectionReason, SinglePlane, TimeToContact
 
@@ -54,7 +54,14 @@ def build_pipeline(detector: DetectorConfig, camera: CameraConfig) -> VoidPipeli
         calibrated = CameraModel.from_file(camera.file) if camera.file else None
     except CameraError as error:
         raise ConfigError(f"camera.file: {error}") from error
-    return VoidPipeline(params, camera, calibrated)
+    vehicle = ObserverParams(
+        vehicle_width_m=detector.vehicle_width_m,
+        vehicle_height_m=detector.vehicle_height_m,
+        baseline_target_m=detector.baseline_m,
+        baseline_min_m=0.4 * detector.baseline_m,
+        baseline_max_m=1.8 * detector.baseline_m,
+    )
+    return VoidPipeline(params, camera, calibrated, vehicle)
 
 
 class VoidPipeline:
@@ -68,10 +75,19 @@ class VoidPipeline:
         Mounting, and the field of view that holds where there is no calibration.
     calibrated
         The camera file's model, at the size that it was made for.
+    vehicle
+        Its size, and how far apart the frames of a pair are taken.
     """
 
-    def __init__(self, params: DetectorParams, camera: CameraConfig, calibrated: CameraModel | None) -> None:
+    def __init__(
+        self,
+        params: DetectorParams,
+        camera: CameraConfig,
+        calibrated: CameraModel | None,
+        vehicle: ObserverParams,
+    ) -> None:
         self._params = params
+        self._observer_params = vehicle
         self._hfov_deg = camera.hfov_deg
         self._calibrated = calibrated
         self._r_body_from_camera = r_body_from_camera(
@@ -100,7 +116,7 @@ class VoidPipeline:
                     pose=pose,
                     detector_s=time.perf_counter() - began_s,
                 )
-            observer = VoidObserver(self._params, model)
+            observer = VoidObserver(self._params, model, observer_params=self._observer_params)
             self._model, self._observer = model, observer
         r_ned_from_camera = (
             None if pose is None else r_ned_from_body(pose.q_ned_from_body) @ self._r_body_from_camera

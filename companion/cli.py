@@ -107,9 +107,18 @@ def _config(arguments: argparse.Namespace) -> int:
 
 
 def _check_config(arguments: argparse.Namespace) -> int:
+    from companion.clock import RealClock
     from companion.config_file import load_config
+    from companion.log import open_log
+    from companion.vision.supervisor import VisionSupervisor
 
-    load_config(Path(arguments.file))
+    config = load_config(arguments.file)
+    with open_log(config.log) as log:
+        # The camera file and the detector's parameters are the worker's to read: one is started for it.
+        supervisor = VisionSupervisor(
+            config.detector, config.camera, clock=RealClock(), on_report=lambda _: None, log=log
+        )
+        asyncio.run(supervisor.validate())
     print(f"{arguments.file}: good")
     return 0
 

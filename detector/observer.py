@@ -229,6 +229,26 @@ class Observation:
             up_camera=up,
         )
 
+    def points_within(self, range_m: float) -> NDArray[np.float64]:
+        """Return what was surely seen nearer than a range, as points of this frame's camera.
+
+        Parameters
+        ----------
+        range_m
+            Points whose range, two standard deviations of parallax added, lies below it.
+
+        Returns
+        -------
+        (N, 3) in m; empty where poses or camera are not known.
+        """
+        geometry = self._geometry
+        if geometry is None or geometry.samples is None:
+            return np.zeros((0, 3))
+        samples = geometry.samples
+        sure = samples.inverse_per_m - 2.0 * samples.sigma_per_m > 1.0 / range_m
+        points: NDArray[np.float64] = samples.points_m[sure & samples.is_resolved]
+        return points
+
 
 @dataclass(frozen=True, slots=True)
 class _Kept:

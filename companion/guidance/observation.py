@@ -74,6 +74,8 @@ class DetectionReport:
         Metric time to contact along the direction, or to the plane; None when not known.
     bearings
         Free distance by azimuth. An azimuth that is not listed is unknown, and unknown is not free.
+    obstacles
+        Places at the vehicle's height where something was surely seen nearby: north and east in local NED, m.
     detector_s
         Seconds that the detector took.
     """
@@ -92,4 +94,5 @@ class DetectionReport:
     distance_m: float | None = None
     distance_spread_m: float | None = None
     bearings: tuple[BearingRange, ...] = ()
+    obstacles: tuple[tuple[float, float], ...] = ()
     detector_s: float = 0.0

@@ -32,6 +32,10 @@ _MAX_ASPECT_CHANGE = 0.02
 _STEEP = math.sin(math.radians(10.0))
 """An axis whose level part is below this points up or down and has no azimuth."""
 _AXIS = np.array([0.0, 0.0, 1.0])
+_NEAR_M = 3.0
+_SQUARE_M = 0.2
+_SQUARE_POINTS = 2
+_MOST_SQUARES = 60
 
 
 def build_pipeline(detector: DetectorConfig, camera: CameraConfig) -> VoidPipeline:
@@ -185,6 +189,14 @@ class VoidPipeline:
             distance_m=distance_m,
             distance_spread_m=spread_m,
             bearings=() if r_ned_from_camera is None else _bearings(observation, model, r_ned_from_camera),
+            obstacles=()
+            if pose is None or r_ned_from_camera is None
+            else obstacles_seen(
+                observation.points_within(_NEAR_M),
+                r_ned_from_camera,
+                pose,
+                self._observer_params.vehicle_height_m,
+            ),
             detector_s=time.perf_counter() - began_s,
         )
 
@@ -219,6 +231,42 @@ def level_rays(model: CameraModel, r_ned_from_camera: Vector) -> list[tuple[floa
         if 0 <= x_px <= model.width_px - 1 and 0 <= y_px <= model.height_px - 1:
             seen.append((azimuth_rad, ray))
     return seen
+
+
+def obstacles_seen(
+    points_camera: Vector, r_ned_from_camera: Vector, pose: Pose, height_m: float
+) -> tuple[tuple[float, float], ...]:
+    """Return the places around the vehicle, at its own height, where something was seen.
+
+    Points are gathered in squares of 0.2 m; a square counts with two of them, and the nearest 60 are returned.
+
+    Parameters
+    ----------
+    points_camera
+        (N, 3) in the camera frame, m.
+    r_ned_from_camera
+        (3, 3).
+    pose
+        Of the vehicle.
+    height_m
+        Points within half of it above or below the vehicle count.
+
+    Returns
+    -------
+    North and east in local NED, m: the middle of the points of each square, the nearest first.
+    """
+    ned = points_camera @ r_ned_from_camera.T
+    flat = ned[np.abs(ned[:, 2]) <= 0.5 * height_m, :2]
+    if len(flat) == 0:
+        return ()
+    squares, member, counts = np.unique(
+        np.floor(flat / _SQUARE_M), axis=0, return_inverse=True, return_counts=True
+    )
+    sums = np.zeros((len(squares), 2))
+    np.add.at(sums, member.reshape(-1), flat)
+    middles = (sums / counts[:, None])[counts >= _SQUARE_POINTS]
+    nearest = middles[np.argsort(np.linalg.norm(middles, axis=1))][:_MOST_SQUARES]
+    return tuple((pose.north_m + float(north), pose.east_m + float(east)) for north, east in nearest)
 
 
 def _bearings(

@@ -17,7 +17,7 @@ from companion.guidance.coordinates import quaternion_from_euler, r_body_from_ca
 from companion.guidance.observation import DetectionReport, Pose
 from companion.log import open_log
 from companion.sim.scene import Scene, corridor, square_wall
-from companion.vision.child import build_pipeline, level_rays, plane_range_m
+from companion.vision.child import build_pipeline, level_rays, obstacles_seen, plane_range_m
 from companion.vision.supervisor import VisionSupervisor
 from detector.camera_model import CameraModel
 from detector.observer import Observation
@@ -275,3 +275,19 @@ async def test_the_real_worker_reports_the_wall(wall_flight, wall_reports):
     assert "single_plane" in {report.kind for report in found}
     assert supervisor.status.restarts == 0
     assert time.monotonic_ns() > supervisor.status.last_report_ns
+
+
+def test_obstacles_are_places_at_the_vehicles_height_seen_more_than_once_nearest_first():
+    points = np.array(
+        [
+            (1.0, 0.0, 2.0), (1.02, 0.02, 2.05),  # right of the axis, at the vehicle's height: two points
+            (-0.5, 0.1, 1.0), (-0.52, 0.12, 1.02),  # nearer, to the left
+            (0.0, 1.0, 1.5), (0.0, 1.01, 1.52),  # the floor
+            (0.9, 0.0, 0.9),  # alone
+        ]
+    )  # fmt: skip
+    facing_north = r_body_from_camera(0.0, 0.0, 0.0)
+    pose = Pose(0, 10.0, 20.0, -1.0, (1.0, 0.0, 0.0, 0.0))
+    found = obstacles_seen(points, facing_north, pose, 0.4)
+    assert found == (pytest.approx((11.01, 19.49)), pytest.approx((12.025, 21.01)))
+    assert obstacles_seen(np.zeros((0, 3)), facing_north, pose, 0.4) == ()

@@ -291,7 +291,6 @@ async def test_a_chatty_worker_neither_blocks_nor_floods_the_log():
         ("strange", "said what is no message"),
         ("mistaken", "said answer out of turn"),
         ("broken", "ZeroDivisionError: a fault of the program"),
-        ("unusable", ": no such file"),
     ],
 )
 async def test_what_is_no_answer_to_the_question_is_not_delivered(pipeline: str, reason: str):
@@ -300,6 +299,21 @@ async def test_what_is_no_answer_to_the_question_is_not_delivered(pipeline: str,
         await bench.died()
         assert reason in bench.status.last_error
         assert bench.reports == []
+
+
+async def test_a_configuration_that_the_first_worker_cannot_use_ends_run():
+    with open_log(LogConfig(), io.StringIO()) as log:
+        supervisor = VisionSupervisor(
+            QUICK,
+            CameraConfig(),
+            clock=RealClock(),
+            on_report=lambda _: None,
+            log=log,
+            pipeline=f"{STUBS}:unusable",
+        )
+        with pytest.raises(ConfigError, match="no such file"):
+            await supervisor.run()
+        assert supervisor.status.state == "stopped"
 
 
 async def test_a_fault_in_on_report_ends_run_and_the_worker():

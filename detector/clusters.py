@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.cluster import KMeans, kmeans_plusplus
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.metrics import calinski_harabasz_score, davies_bouldin_score
 
 Starts = Callable[[NDArray[np.float64], int], Sequence[NDArray[np.float64]]]
 """Given the samples and n, the (n, D) initial centres of each k-means run."""
@@ -45,8 +49,11 @@ def seeded_starts(seed: int, restarts: int) -> Starts:
     """Return k-means++ starts drawn from ``seed``: the same samples and n always give the same starts."""
 
     def starts(samples: NDArray[np.float64], n: int) -> list[NDArray[np.float64]]:
-        rng = np.random.default_rng([seed, n])
-        return [_spread_out(samples, n, rng) for _ in range(restarts)]
+        random = np.random.RandomState([seed % (1 << 32), n])
+        return [
+            np.asarray(kmeans_plusplus(samples, n, random_state=random)[0], np.float64)
+            for _ in range(restarts)
+        ]
 
     return starts
 
@@ -54,7 +61,7 @@ def seeded_starts(seed: int, restarts: int) -> Starts:
 def kmeans(
     samples: NDArray[np.float64], initial: NDArray[np.float64], max_iterations: int = 300
 ) -> Clustering:
-    """Lloyd's algorithm from given centres until no sample changes its cluster.
+    """Lloyd's algorithm (scikit-learn's) from given centres until no sample changes its cluster.
 
     Parameters
     ----------
@@ -64,27 +71,19 @@ def kmeans(
         (n, D) initial centres.
     max_iterations
         Most rounds.
-
-    Returns
-    -------
-    Clustering
-        A cluster that runs empty takes the sample that is furthest from its centre.
     """
     if len(samples) < len(initial):
         raise ValueError(f"expected at least as many samples as centres, got {len(samples)}, {len(initial)}")
-    centres = np.array(initial, dtype=np.float64)
-    n = len(centres)
-    labels = np.full(len(samples), -1, dtype=np.intp)
-    for _ in range(max_iterations):
-        distances = _squared_distances(samples, centres)
-        new_labels = np.argmin(distances, axis=1)
-        if np.array_equal(new_labels, labels):
-            break
-        labels = new_labels
-        centres = _means(samples, labels, distances[np.arange(len(samples)), labels], n)
-    distances = _squared_distances(samples, centres)
-    labels = np.argmin(distances, axis=1)
-    return Clustering(centres, labels, float(distances[np.arange(len(samples)), labels].sum()))
+    model = KMeans(len(initial), init=initial, n_init=1, max_iter=max_iterations, tol=0.0, algorithm="lloyd")
+    with warnings.catch_warnings():
+        # Fewer distinct samples than clusters, or rounds used up: the result is what there is.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model.fit(samples)
+    return Clustering(
+        np.asarray(model.cluster_centers_, np.float64),
+        np.asarray(model.labels_, np.intp),
+        float(model.inertia_),
+    )
 
 
 def best_of(samples: NDArray[np.float64], n: int, starts: Starts, max_iterations: int = 300) -> Clustering:
@@ -95,28 +94,22 @@ def best_of(samples: NDArray[np.float64], n: int, starts: Starts, max_iterations
 
 def calinski_harabasz(samples: NDArray[np.float64], clustering: Clustering) -> float:
     """Return the Calinski-Harabasz index: dispersion between over dispersion within; larger is better."""
-    used, sizes, centres = _used(samples, clustering)
-    n_samples, n = len(samples), len(sizes)
-    if n < 2 or n_samples <= n:
+    if not _is_defined(samples, clustering):
         return 0.0
-    between = float((sizes * ((centres - samples.mean(axis=0)) ** 2).sum(axis=1)).sum())
-    within = float(((samples - centres[used]) ** 2).sum())
-    if within == 0.0:
-        return 1.0  # as scikit-learn defines it
-    return between * (n_samples - n) / (within * (n - 1))
+    return float(calinski_harabasz_score(samples, clustering.labels))
 
 
 def davies_bouldin(samples: NDArray[np.float64], clustering: Clustering) -> float:
     """Return the Davies-Bouldin index: mean over clusters of the worst (spread + spread) / distance; smaller is better."""
-    used, sizes, centres = _used(samples, clustering)
-    if len(sizes) < 2:
+    if not _is_defined(samples, clustering):
         return 0.0
-    distances = np.sqrt(((samples - centres[used]) ** 2).sum(axis=1))
-    spreads = np.bincount(used, weights=distances, minlength=len(sizes)) / sizes
-    apart = np.sqrt(_squared_distances(centres, centres))
-    np.fill_diagonal(apart, np.inf)
-    apart[apart == 0.0] = np.inf  # two centres in one place: scikit-learn's rule
-    return float(((spreads[:, None] + spreads[None, :]) / apart).max(axis=1).mean())
+    return float(davies_bouldin_score(samples, clustering.labels))
+
+
+def _is_defined(samples: NDArray[np.float64], clustering: Clustering) -> bool:
+    """Whether the indices are: at least two clusters hold samples, and not each sample is one of its own."""
+    used = len(np.unique(clustering.labels))
+    return 2 <= used < len(samples)
 
 
 def choose_n(
@@ -209,51 +202,3 @@ def plane_ratio(centre_magnitudes: NDArray[np.float64]) -> float:
 def _squared_distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     squared: NDArray[np.float64] = ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=2)
     return squared
-
-
-def _means(
-    samples: NDArray[np.float64], labels: NDArray[np.intp], squared: NDArray[np.float64], n: int
-) -> NDArray[np.float64]:
-    labels = labels.copy()
-    sizes = np.bincount(labels, minlength=n)
-    empty = np.flatnonzero(sizes == 0)
-    if len(empty):
-        furthest = np.argsort(-squared, kind="stable")[: len(empty)]
-        labels[furthest] = empty
-        sizes = np.bincount(labels, minlength=n)
-    sums = np.column_stack(
-        [np.bincount(labels, weights=samples[:, d], minlength=n) for d in range(samples.shape[1])]
-    )
-    # A cluster of one can lose its sample to an empty one; then it keeps no mean and sits on that sample.
-    means: NDArray[np.float64] = sums / np.maximum(sizes, 1)[:, None]
-    for lost in np.flatnonzero(sizes == 0):
-        means[lost] = samples[int(np.argmax(squared))]
-    return means
-
-
-def _used(
-    samples: NDArray[np.float64], clustering: Clustering
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """Return labels renumbered without gaps, sizes and true means of the clusters that hold samples."""
-    _, labels, counts = np.unique(clustering.labels, return_inverse=True, return_counts=True)
-    sizes = counts.astype(np.float64)
-    sums = np.column_stack(
-        [np.bincount(labels, weights=samples[:, d], minlength=len(sizes)) for d in range(samples.shape[1])]
-    )
-    return labels.astype(np.intp), sizes, sums / sizes[:, None]
-
-
-def _spread_out(samples: NDArray[np.float64], n: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """k-means++ (Arthur and Vassilvitskii 2007): each next centre with a chance as its squared distance."""
-    chosen = [int(rng.integers(len(samples)))]
-    squared = ((samples - samples[chosen[0]]) ** 2).sum(axis=1)
-    for _ in range(n - 1):
-        total = float(squared.sum())
-        if total > 0.0:
-            reached = int(np.searchsorted(np.cumsum(squared), rng.random() * total, side="right"))
-            index = min(reached, len(samples) - 1)
-        else:
-            index = int(rng.integers(len(samples)))  # fewer distinct samples than clusters
-        chosen.append(index)
-        squared = np.minimum(squared, ((samples - samples[index]) ** 2).sum(axis=1))
-    return samples[chosen].copy()

@@ -169,10 +169,6 @@ def test_same_pair_same_answer(scene: Scene, preset: PresetName) -> None:
     assert first.diagnostics.centre_points_px == second.diagnostics.centre_points_px
 
 
-@pytest.mark.xfail(
-    reason="the paper's single-plane test on cluster centres takes open rooms for walls where few clusters are chosen",
-    strict=False,
-)
 @pytest.mark.parametrize("turn_deg", [(0, 0, 0), (4, -2, 3)], ids=["straight", "turning"])
 @pytest.mark.parametrize("scene", [corridor(), empty_room()], ids=["corridor", "room"])
 def test_a_way_is_seen_where_there_is_one(scene: Scene, turn_deg: tuple[float, float, float]) -> None:

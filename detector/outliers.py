@@ -40,7 +40,7 @@ def length_filter(lengths_px: NDArray[np.float64], shortest_fraction: float = 0.
     -------
     (N,) bool, True for those that stay, in their order.
     """
-    # The small term keeps 0.1 * 30 from falling to 2 in binary floating point.
+    # The small term keeps 0.29 * 100 from falling to 28 in binary floating point.
     n_dropped = int(np.floor(shortest_fraction * len(lengths_px) + 1e-9))
     kept = np.ones(len(lengths_px), np.bool_)
     kept[np.argsort(lengths_px, kind="stable")[:n_dropped]] = False

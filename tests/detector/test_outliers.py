@@ -29,9 +29,9 @@ def test_of_equal_lengths_the_earlier_go_first() -> None:
     assert length_filter(np.ones(20), 0.1).tolist() == [False, False] + [True] * 18
 
 
-@pytest.mark.parametrize("n", range(10, 1000, 10))
-def test_a_tenth_of_whole_tens_is_whole(n: int) -> None:
-    assert (~length_filter(np.arange(n, dtype=float), 0.1)).sum() == n // 10
+@pytest.mark.parametrize(("n", "hundredths"), [(100, 29), (100, 57), (200, 29), (50, 58), (30, 10), (30, 20)])
+def test_a_whole_share_is_dropped_whole_whatever_it_is_in_binary(n: int, hundredths: int) -> None:
+    assert (~length_filter(np.arange(n, dtype=float), hundredths / 100)).sum() == n * hundredths // 100
 
 
 @given(angles=st.lists(degrees, min_size=3, max_size=60), turn=degrees)

@@ -273,7 +273,7 @@ def test_same_input_and_seed_same_answer_other_seed_other_starts(preset: PresetN
         VoidDetector(DetectorParams.preset(preset, seed=seed, kmeans_restarts=1))
         .detect(*pair)
         .detection.diagnostics.centre_points_px
-        for seed in range(4)
+        for seed in range(2)
     ]
     assert len(set(seen)) > 1
 

@@ -37,3 +37,10 @@ def test_the_share_is_of_the_lmccs_flow_not_of_the_candidates() -> None:
     # 1 of 4 is a quarter, 1 of 5 a fifth: 0.22 lies between.
     assert elect(candidate, LMCC, 4.0, ENDS, np.full(3, 5.0), 1, 0.22) is None
     assert elect(candidate, LMCC, 5.0, ENDS, np.full(3, 4.0), 1, 0.22) is not None
+
+
+def test_the_nearest_candidate_is_examined_wherever_it_stands_in_the_list() -> None:
+    flows = np.array([99.0, 99.0, 10.0])
+    near, far = [300.0, 100.0], [500.0, 100.0]
+    for order in ([near, far], [far, near]):
+        assert elect(np.array(order), LMCC, 10.0, ENDS, flows, 1) is None

@@ -122,7 +122,8 @@ def choose_n(
 ) -> Clustering:
     """Return the clustering whose n has the largest CH / DB.
 
-    The paper wants "the biggest CH and the lowest DB"; their quotient joins the two. The smaller n wins a tie.
+    The paper wants "the biggest CH and the lowest DB"; their quotient joins the two. The smaller n wins a tie,
+    and the first that leaves nothing within its clusters ends the search.
 
     Raises
     ------
@@ -136,6 +137,8 @@ def choose_n(
     for n in range(n_min, n_max + 1):
         clustering = best_of(samples, n, starts, max_iterations)
         spread = davies_bouldin(samples, clustering)
+        if spread == 0.0 and _is_defined(samples, clustering):
+            return clustering  # every sample on its centre: no other n can be better
         score = calinski_harabasz(samples, clustering) / spread if spread > 0.0 else 0.0
         if best is None or score > best[0]:
             best = (score, clustering)

@@ -88,3 +88,11 @@ def test_an_empty_field_is_no_error() -> None:
         spread = angle_spread(np.zeros(0), statistics)  # type: ignore[arg-type]
         assert angular_filter(spread, choose_p(spread)).shape == (0,)
     assert length_filter(np.zeros(0)).shape == (0,)
+
+
+@pytest.mark.parametrize(("before", "after"), [(1725, 1553), (331, 298), (1192, 1073), (538, 485)])
+def test_the_length_filter_gives_the_counts_of_the_papers_table_1(before: int, after: int) -> None:
+    lengths = np.random.default_rng(0).random(before)
+    kept = length_filter(lengths)
+    assert kept.sum() == after
+    assert lengths[~kept].max() < lengths[kept].min()

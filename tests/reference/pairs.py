@@ -1,29 +1,9 @@
-"""The pairs that the detector and the oracle are compared on: real, rendered and made here with known flow."""
+"""Pairs made here with known flow, and the texture they are made of."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
-
-DATA = Path(__file__).parents[1] / "data" / "pairs"
-
-FILES = {
-    "office_plane": ("office/00184.jpg", "office/00185.jpg"),
-    "office_open": ("office/00193.jpg", "office/00194.jpg"),
-    "brick_far": ("brickwall/001.jpg", "brickwall/003.jpg"),
-    "brick_near": ("brickwall/033.jpg", "brickwall/035.jpg"),
-    "brick_too_near": ("brickwall/061.jpg", "brickwall/063.jpg"),
-}
-MADE = ("approach", "window", "still", "blank")
-
-
-def load(name):
-    """Return the two grey images of a pair."""
-    if name in FILES:
-        return tuple(cv2.imread(str(DATA / file), cv2.IMREAD_GRAYSCALE) for file in FILES[name])
-    return {"approach": approach, "window": window, "still": still, "blank": blank}[name]()
 
 
 def texture(width=640, height=480, seed=1):
@@ -66,15 +46,3 @@ def window():
         )
 
     return seen(1.0, 1.0), seen(1.18, 1.015)
-
-
-def still():
-    """Nothing moves but the noise of the sensor."""
-    image, rng = texture(), np.random.default_rng(5)
-    return tuple(np.clip(image + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8) for _ in range(2))
-
-
-def blank():
-    """A plain wall: hardly a key point."""
-    ramp = np.tile(np.linspace(90, 160, 640), (480, 1)).astype(np.uint8)
-    return ramp, ramp.copy()

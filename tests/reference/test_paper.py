@@ -15,6 +15,7 @@ from detector.clusters import seeded_starts
 from detector.params import DetectorParams, PresetName
 from detector.pipeline import VoidDetector
 from detector.results import Direction, NoDetection, SinglePlane
+from tests.reference.pairs import approach, window
 from tests.reference.paper import Answer, Settings, void_of_pair
 
 DATA = Path(__file__).parents[1] / "data" / "pairs"
@@ -39,6 +40,8 @@ RENDERED = {
     "room with a wall": (room_with_wall, {"wall_north_m": 3.0, "seed": 3}, -1.3),
     "square wall": (square_wall, {"distance_m": 3.0, "seed": 5}, 0.0),
 }
+MADE = {"approach": approach, "window": window}
+NAMES = (*REAL, *RENDERED, *MADE)
 
 
 @cache
@@ -46,6 +49,8 @@ def pair_of(name: str) -> tuple[np.ndarray, np.ndarray]:
     if name in REAL:
         earlier, later = (cv2.imread(str(DATA / file), cv2.IMREAD_GRAYSCALE) for file in REAL[name])
         return earlier, later
+    if name in MADE:
+        return MADE[name]()
     make, arguments, down_m = RENDERED[name]
     scene = make(**arguments)
     first, second = (scene.render(CAMERA, (north_m, 0.0, down_m), LOOKING_NORTH) for north_m in (0.0, STEP_M))
@@ -106,7 +111,7 @@ def kind_of(detection: Direction | SinglePlane | NoDetection) -> str:
 
 
 @pytest.mark.parametrize("preset", ["paper", "default"])
-@pytest.mark.parametrize("name", [*REAL, *RENDERED])
+@pytest.mark.parametrize("name", NAMES)
 def test_the_detector_and_the_oracle_agree_step_by_step(name: str, preset: PresetName) -> None:
     oracle = oracle_of(name, preset)
     params = params_of(preset)
@@ -129,7 +134,7 @@ def test_the_detector_and_the_oracle_agree_step_by_step(name: str, preset: Prese
 
 
 def test_the_pairs_reach_every_end_of_the_method() -> None:
-    kinds = {oracle_of(name, preset).kind for name in (*REAL, *RENDERED) for preset in ("paper", "default")}
+    kinds = {oracle_of(name, preset).kind for name in NAMES for preset in ("paper", "default")}
     assert kinds >= {
         "vanishing_point",
         "lowest_flow",

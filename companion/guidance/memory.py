@@ -12,6 +12,8 @@ from companion.guidance.freshness import expiry
 from companion.guidance.observation import BearingRange, DetectionReport, Pose
 
 _BIN_RAD = math.radians(3.0)
+_TRACK_GAP_M = 1.0
+"""Two positions in a row further apart than this: what lies between was not seen to be flown."""
 _MATCH_RAD = math.radians(4.0)
 """A bearing stands for directions this close to it (half the vehicle's width at 5 m)."""
 
@@ -20,7 +22,9 @@ class SeenBearings:
     """Free distances by azimuth, as measured lately. An azimuth not in here is unknown, not free."""
 
     def __init__(self, limits: GuidanceConfig) -> None:
-        self._limits = limits
+        # A bearing is a direction in the world: turning the vehicle does not make it worse, so only the
+        # limits on distance and age count here.
+        self._limits = limits.model_copy(update={"redetect_yaw_deg": 180.0})
         self._by_bin: dict[int, tuple[BearingRange, DetectionReport]] = {}
 
     def clear(self) -> None:
@@ -51,20 +55,23 @@ class SeenBearings:
     def free_azimuths(
         self, at_least_m: float, pose: Pose, speed_m_s: float, now_ns: int
     ) -> list[tuple[float, float]]:
-        """Return (azimuth_rad, free distance in m) of all bearings known free that far."""
-        return [
-            (bearing.azimuth_rad, free_m)
+        """Return (azimuth_rad, free distance in m) of all bearings known free that far, neighbours included."""
+        fresh = [
+            (bearing.azimuth_rad, _remaining_m(bearing, report, pose))
             for bearing, report in self._fresh(pose, speed_m_s, now_ns)
-            if (free_m := _remaining_m(bearing, report, pose)) >= at_least_m
         ]
+        free = [
+            (azimuth, min(m for other, m in fresh if abs(wrap_rad(other - azimuth)) <= _MATCH_RAD))
+            for azimuth, _ in fresh
+        ]
+        return [(azimuth, free_m) for azimuth, free_m in free if free_m >= at_least_m]
 
     def _fresh(self, pose: Pose, speed_m_s: float, now_ns: int) -> list[tuple[BearingRange, DetectionReport]]:
-        # A bearing is a direction in the world: turning the vehicle does not make it worse, so only the
-        # limits on distance and age count here.
         reports = {id(report): report for _, report in self._by_bin.values()}
-        turned_free = self._limits.model_copy(update={"redetect_yaw_deg": 180.0})
         good = {
-            key for key, report in reports.items() if not expiry(report, pose, speed_m_s, now_ns, turned_free)
+            key
+            for key, report in reports.items()
+            if not expiry(report, pose, speed_m_s, now_ns, self._limits)
         }
         return [(bearing, report) for bearing, report in self._by_bin.values() if id(report) in good]
 
@@ -91,7 +98,9 @@ class Track:
         self._points.clear()
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Take the vehicle's position."""
+        """Take the vehicle's position; after a gap the track begins anew."""
+        if self._points and math.dist(self._points[-1], (north_m, east_m)) > _TRACK_GAP_M:
+            self._points.clear()
         if not self._points or math.dist(self._points[-1], (north_m, east_m)) >= self._spacing_m:
             self._points.append((north_m, east_m))
 

@@ -76,6 +76,8 @@ class DetectionReport:
         Free distance by azimuth. An azimuth that is not listed is unknown, and unknown is not free.
     obstacles
         Places at the vehicle's height where something was surely seen nearby: north and east in local NED, m.
+    earlier_frame_ns
+        When the first frame of the pair was exposed, where there was one and it is known.
     detector_s
         Seconds that the detector took.
     """
@@ -95,4 +97,5 @@ class DetectionReport:
     distance_spread_m: float | None = None
     bearings: tuple[BearingRange, ...] = ()
     obstacles: tuple[tuple[float, float], ...] = ()
+    earlier_frame_ns: int | None = None
     detector_s: float = 0.0

@@ -21,6 +21,7 @@ _CLOCK_DRIFT = 200e-6
 """Greatest relative drift of two quartz clocks that the mapping follows."""
 _REBOOT_NS = 1_000_000_000
 """The autopilot's time going back by more than this means that it has restarted."""
+_JUMP_PREDICTED_S = 1.0
 _KEEP_NS = 3_000_000_000
 _MAX_GAP_NS = 500_000_000
 """Samples further apart than this are not interpolated between: what happened there is not known."""
@@ -84,7 +85,8 @@ class PoseBuffer:
     Parameters
     ----------
     jump_m
-        A position further than this from where the last velocity leads is an estimator reset.
+        A position further than this from where the last velocity leads, or from the last one after more
+        than a second of silence, is an estimator reset.
     max_extrapolation_s
         Longest time past the newest sample that a pose is extrapolated with velocity and body rates.
     """
@@ -173,8 +175,10 @@ class PoseBuffer:
             return False
         last = self._positions[-1]
         dt_s = (sample.time_ns - last.time_ns) / 1e9
-        if not 0 <= dt_s <= 1.0:
+        if dt_s < 0:
             return False
+        if dt_s > _JUMP_PREDICTED_S:  # no velocity leads that far: what happened meanwhile is not known
+            return math.dist(sample.ned_m, last.ned_m) > self._jump_m
         off_m = math.dist(
             sample.ned_m,
             [

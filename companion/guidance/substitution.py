@@ -43,7 +43,13 @@ _MIN_STEP_M = 0.2
 """A way that is not free for this much (beyond the margin) is blocked."""
 _NEW_GOAL_M = 0.5
 """A goal that jumps further than this from one setpoint to the next is a new one."""
+_GOAL_SPEED_M_S = 3.0
+"""Up to this speed a goal that is streamed slowly is taken to move, not to be a new one each time."""
 _GOAL_STILL_M = 0.1
+_ARRIVED_FACTOR = 1.5
+"""Once arrived, the goal stays reached up to this many arrival radii: a hovering vehicle wanders."""
+_MEASURED_FREE_FACTOR = 0.7
+"""In FOLLOW this share of a step measured free is enough to stay: the step is shortened to it anyway."""
 _LOOK_AGAIN = "way blocked, looking again"
 """One answer says that no way is open: no step is made, and the vote of the next answers decides."""
 _NO_WAY_OUT = "no way out"
@@ -53,6 +59,14 @@ _PROGRESS_M = 0.75
 _TURN_DONE_RAD = math.radians(5.0)
 _COMMAND_RECENT_NS = 500_000_000
 _MAX_SLEW_DT_S = 0.2
+_MAX_YAW_LEAD_RAD = math.radians(30.0)
+"""A commanded yaw is never further ahead of the heading: a vehicle that could not turn must not snap round."""
+_FUTURE_NS = 100_000_000
+"""A report about a frame further ahead of our time than this is refused: its clock is not ours."""
+_PAIR_AGE_NS = 4_000_000_000
+"""Where a report does not name its earlier frame, that frame may be this much older than the later one."""
+_REASON_KEPT_NS = 2_000_000_000
+"""While nothing but the reason of HOLD changes, it is announced at most this often."""
 
 
 class State(StrEnum):
@@ -138,6 +152,7 @@ class Switch:
         self._state = State.DISENGAGED
         self._reason = "start"
         self._entered_ns = 0
+        self._reason_ns = 0
         self._events: list[Event] = []
         # inputs
         self._engaged: bool | None = None  # None: no heartbeat of the autopilot yet
@@ -147,7 +162,9 @@ class Switch:
         self._last_report_ns: int | None = None
         self._newest_frame_ns = -(1 << 62)
         self._goal: tuple[float, float] | None = None
+        self._goal_before: tuple[float, float] | None = None
         self._goal_seen_ns = 0
+        self._arrived = False
         self._goal_still: tuple[float, float] = (0.0, 0.0)
         self._goal_still_since_ns = 0
         # memory, cleared when the mode is left
@@ -156,6 +173,7 @@ class Switch:
         self._bad_reports = 0
         self._votes: deque[DetectionReport | None] = deque(maxlen=config.wall_n)
         self._answers_after_ns = -(1 << 62)
+        self._pairs_after_ns = -(1 << 62)
         self._seen = SeenBearings(config)
         self._track = Track()
         self._episode: Episode | None = None
@@ -163,6 +181,7 @@ class Switch:
         self._anchor_yaw_rad = 0.0
         self._turn_target_rad = 0.0
         self._probe_target: tuple[float, float] = (0.0, 0.0)
+        self._probe_yaw_rad = 0.0
         self._probed = ""
         self._steer_start: tuple[float, float] = (0.0, 0.0)
         self._commanded_yaw_rad = 0.0
@@ -236,10 +255,13 @@ class Switch:
         """Drop all that was measured in the old local frame; stay engaged and anchor the hold anew."""
         self._pose = None
         self._drop_measurements(now_ns)
+        self._pairs_after_ns = now_ns
         self._track.clear()
         self._episode = None
         self._anchor = None
+        self._arrived = False
         self._progress = None
+        self._commanded_ns = -(1 << 62)
         if self._engaged and self._state is not State.DISENGAGED:
             self._enter(State.HOLD, f"estimator reset ({why})", now_ns)
 
@@ -255,8 +277,11 @@ class Switch:
             self._faults[name] = reason
 
     def on_report(self, report: DetectionReport, now_ns: int) -> None:
-        """Take one report of the vision worker; one about an older frame than the last is ignored."""
-        if report.frame_ns <= self._newest_frame_ns:
+        """Take one report of the vision worker; one about an older frame than the last is ignored.
+
+        So is one about a frame of the future: it would make all later ones look old.
+        """
+        if report.frame_ns <= self._newest_frame_ns or report.frame_ns > now_ns + _FUTURE_NS:
             return
         self._newest_frame_ns = report.frame_ns
         self._last_report_ns = now_ns
@@ -269,6 +294,8 @@ class Switch:
             return
         if report.frame_ns < self._answers_after_ns or report.pose is None:
             return
+        if _pair_began_ns(report) < self._pairs_after_ns:
+            return  # its two poses are not of one local frame: the way flown between them is not known
         self._bad_reports = 0
         self._seen.add(report)
         if report.kind == "single_plane":
@@ -338,8 +365,12 @@ class Switch:
         bearing = math.atan2(to_east, to_north) if goal_m > 1e-6 else look
         answer, no_answer = self._good_answer(pose, now_ns)
         wall = self._wall(goal_m, pose, now_ns)
+        free_bearing_m = self._seen.free_m(bearing, pose, self._speed_m_s, now_ns)
         still_s = (now_ns - self._goal_still_since_ns) / 1e9
-        reached = goal_m <= config.arrive_radius_m and still_s >= config.goal_settle_s and wall is None
+        radius_m = config.arrive_radius_m * (_ARRIVED_FACTOR if self._arrived else 1.0)
+        nothing_nearer = wall is None and (free_bearing_m is None or free_bearing_m >= goal_m)
+        reached = goal_m <= radius_m and still_s >= config.goal_settle_s and nothing_nearer
+        self._arrived = reached
         return _Situation(
             now_ns=now_ns,
             setpoint=setpoint,
@@ -353,7 +384,7 @@ class Switch:
             answer=answer,
             no_answer=no_answer,
             wall=wall,
-            free_bearing_m=self._seen.free_m(bearing, pose, self._speed_m_s, now_ns),
+            free_bearing_m=free_bearing_m,
         )
 
     def _good_answer(self, pose: Pose, now_ns: int) -> tuple[_Answer | None, str]:
@@ -422,6 +453,8 @@ class Switch:
     def _is_measured_free(self, s: _Situation) -> bool:
         """Whether the whole next step toward the goal is known to be free."""
         step_m = min(s.goal_m, self._config.max_step_m)
+        if self._state is State.FOLLOW:
+            step_m *= _MEASURED_FREE_FACTOR
         return s.free_bearing_m is not None and s.free_bearing_m - self._config.step_margin_m >= step_m
 
     def _choose(self, s: _Situation) -> tuple[State, str]:
@@ -473,11 +506,12 @@ class Switch:
 
     def _from_steer(self, s: _Situation) -> tuple[State, str] | None:
         state, reason = self._choose(s)
-        if state is State.ALIGN:
+        if state is State.ALIGN and s.answer is not None:
             flown_m = math.dist(self._steer_start, (s.pose.north_m, s.pose.east_m))
-            if flown_m < self._config.commit_distance_m:
-                return None
-            return State.ALIGN, "looking towards the goal again"
+            if flown_m >= self._config.commit_distance_m:
+                return State.ALIGN, "looking towards the goal again"
+            # Without a way to go on along, there is nothing to be committed to.
+            return None if self._is_open(self._void_free_m(s.answer, s), math.inf) else (state, reason)
         return None if state is State.STEER or reason == _LOOK_AGAIN else (state, reason)
 
     def _from_turn(self, s: _Situation) -> tuple[State, str] | None:
@@ -485,7 +519,11 @@ class Switch:
             return State.FOLLOW, "at the goal"
         episode = self._episode
         if episode is None:  # ended by a new goal while turning
-            return self._choose(s)
+            state, reason = self._choose(s)
+            if state is not State.TURN:
+                return state, reason
+            episode = self._begin_or_keep_episode(s.pose)
+            self._begin_turn(s.pose)
         if episode.sweep_rad >= math.tau - 1e-6:
             return State.HOLD, _NO_WAY_OUT
         step_s = self._config.turn_step_deg / self._config.yaw_rate_deg_s
@@ -529,6 +567,8 @@ class Switch:
             no_texture = last is not None and last.kind == "none" and last.reason not in _NO_PARALLAX
             if not no_texture and self._probe_choice(s) is not None:
                 return State.PROBE, "no parallax"
+        if s.now_ns - self._reason_ns < _REASON_KEPT_NS:
+            return None  # the detector's reasons may change with every picture
         return State.HOLD, reason
 
     # ------------------------------------------------------------------ entering a state
@@ -539,15 +579,18 @@ class Switch:
             return
         self._events.append(StateChanged(now_ns, previous, state, reason))
         self._reason = reason
+        self._reason_ns = now_ns
         if state is previous:
             return  # HOLD with another reason: its anchor and its time stay
         self._state = state
         self._entered_ns = now_ns
+        if state not in _HELD_STATES:
+            self._anchor = None
         pose = self._pose
         if pose is None:
             return
         here = (pose.north_m, pose.east_m)
-        if state in _HELD_STATES and (previous not in _HELD_STATES or self._anchor is None):
+        if state in _HELD_STATES and self._anchor is None:
             self._set_anchor(pose)
         elif state is State.HOLD:
             self._anchor_yaw_rad = heading_rad(pose.q_ned_from_body)
@@ -564,12 +607,14 @@ class Switch:
         self._anchor = (pose.north_m, pose.east_m)
         self._anchor_yaw_rad = heading_rad(pose.q_ned_from_body)
 
-    def _begin_or_keep_episode(self, pose: Pose) -> None:
-        if self._episode is None or self._episode.over(pose, self._config.episode_distance_m):
-            self._episode = Episode(pose.north_m, pose.east_m)
+    def _begin_or_keep_episode(self, pose: Pose) -> Episode:
+        episode = self._episode
+        if episode is None or episode.over(pose, self._config.episode_distance_m):
+            episode = self._episode = Episode(pose.north_m, pose.east_m)
         if self._goal is not None:
             bearing = math.atan2(self._goal[1] - pose.east_m, self._goal[0] - pose.north_m)
-            self._episode.block(bearing, pose)
+            episode.block(bearing, pose)
+        return episode
 
     def _begin_turn(self, pose: Pose) -> None:
         look = wrap_rad(heading_rad(pose.q_ned_from_body) + self._camera_yaw_rad)
@@ -589,7 +634,7 @@ class Switch:
         here = (pose.north_m, pose.east_m)
         look = wrap_rad(heading_rad(pose.q_ned_from_body) + self._camera_yaw_rad)
         choice = self._probe_point(pose, look, now_ns)
-        self._set_anchor(pose)
+        self._probe_yaw_rad = heading_rad(pose.q_ned_from_body)
         self._answer = None
         self._votes.clear()
         self._answers_after_ns = now_ns
@@ -640,12 +685,15 @@ class Switch:
         if self._state is State.STEER and s.answer is not None:
             psi = s.answer.azimuth_rad
             step_m = self._step_m(s.goal_m, self._void_free_m(s.answer, s))
-            if abs(wrap_rad(psi - s.look_rad)) > math.radians(self._config.align_deg):
-                step_m = 0.0  # the camera must look where it flies
+            out_of_sight = abs(wrap_rad(psi - s.look_rad)) > math.radians(self._config.align_deg)
+            if out_of_sight or self._choose(s)[1] == _LOOK_AGAIN:
+                step_m = (
+                    0.0  # the camera must look where it flies, and no way is open before it is seen again
+                )
             x, y = here[0] + step_m * math.cos(psi), here[1] + step_m * math.sin(psi)
             return self._rewrite(x, y, psi - self._camera_yaw_rad, "substituted", s)
         if self._state is State.PROBE:
-            return self._rewrite(*self._probe_target, self._anchor_yaw_rad, "substituted", s)
+            return self._rewrite(*self._probe_target, self._probe_yaw_rad, "substituted", s)
         if self._anchor is None:
             self._set_anchor(s.pose)
         x, y = self._anchor or here
@@ -666,13 +714,17 @@ class Switch:
         sp = s.setpoint
         yaw_used = not sp.type_mask & TypeMask.YAW_IGNORE
         if s.reached:
-            step_m, wanted_yaw = s.goal_m, (sp.yaw if yaw_used else None)
+            step_m, wanted_yaw = min(s.goal_m, self._config.max_step_m), (sp.yaw if yaw_used else None)
         else:
             free_m = s.free_bearing_m
             if s.answer is not None and s.answer.is_plane:
                 plane_m = self._remaining_m(s.answer.report, s.pose)
                 free_m = plane_m if free_m is None else min(free_m, plane_m)
+            elif s.answer is not None and free_m is None:
+                free_m = self._void_free_m(s.answer, s)  # the void agrees: the next best that is known
             step_m = self._step_m(s.goal_m, free_m)
+            if self._choose(s)[1] == _LOOK_AGAIN:
+                step_m = 0.0
             wanted_yaw = s.bearing_rad - self._camera_yaw_rad
             if yaw_used and abs(wrap_rad(sp.yaw + self._camera_yaw_rad - s.bearing_rad)) <= math.radians(
                 self._config.view_deg
@@ -731,12 +783,13 @@ class Switch:
 
     def _slewed(self, yaw_rad: float, s: _Situation) -> float:
         """Return the next yaw on the way to ``yaw_rad``: autopilots do not all cap the rate themselves."""
+        heading = heading_rad(s.pose.q_ned_from_body)
         since_ns = s.now_ns - self._commanded_ns
+        start = heading
         if since_ns <= _COMMAND_RECENT_NS:
-            start, dt_s = self._commanded_yaw_rad, min(since_ns / 1e9, _MAX_SLEW_DT_S)
-        else:
-            start, dt_s = heading_rad(s.pose.q_ned_from_body), 0.0
-        cap = math.radians(self._config.yaw_rate_deg_s) * dt_s
+            lead = wrap_rad(self._commanded_yaw_rad - heading)
+            start += max(-_MAX_YAW_LEAD_RAD, min(_MAX_YAW_LEAD_RAD, lead))
+        cap = math.radians(self._config.yaw_rate_deg_s) * min(since_ns / 1e9, _MAX_SLEW_DT_S)
         return wrap_rad(start + max(-cap, min(cap, wrap_rad(yaw_rad - start))))
 
     def _without_protection(self, setpoint: LocalSetpoint, fault: str, now_ns: int) -> Verdict:
@@ -762,9 +815,20 @@ class Switch:
 
     def _note_goal(self, setpoint: LocalSetpoint, now_ns: int) -> None:
         goal = (setpoint.x, setpoint.y)
-        silent = now_ns - self._goal_seen_ns > self._config.planner_timeout_s * 1e9
+        since_s = (now_ns - self._goal_seen_ns) / 1e9
+        silent = since_s > self._config.planner_timeout_s
         self._goal_seen_ns = now_ns
-        if self._goal is None or silent or math.dist(self._goal, goal) > _NEW_GOAL_M:
+        jump_m = max(_NEW_GOAL_M, _GOAL_SPEED_M_S * since_s)
+        if self._goal is None or silent:
+            is_new, self._goal_before = True, None
+        elif math.dist(self._goal, goal) <= jump_m:
+            is_new = False
+        else:
+            # Two planners that take turns do not bring a new goal each time.
+            before, self._goal_before = self._goal_before, self._goal
+            is_new = before is None or math.dist(before, goal) > jump_m
+            self._goal_still, self._goal_still_since_ns = goal, now_ns
+        if is_new:
             self._episode = None
             self._gave_up = False
             self._progress = None
@@ -812,5 +876,13 @@ class Switch:
         self._anchor = None
         self._progress = None
         self._gave_up = self._gave_up_on_fault = False
-        self._goal = None
+        self._goal = self._goal_before = None
+        self._arrived = False
         self._commanded_ns = -(1 << 62)
+
+
+def _pair_began_ns(report: DetectionReport) -> int:
+    """Return when the earlier frame of a report's pair was exposed, at the earliest where it is not said."""
+    if report.earlier_frame_ns is not None:
+        return report.earlier_frame_ns
+    return report.frame_ns - _PAIR_AGE_NS

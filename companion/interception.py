@@ -58,6 +58,7 @@ class Interception:
         self._reset_counter: int | None = None
         self._autopilot_heartbeat_ns: int | None = None
         self._heartbeat_lost = False
+        self._was_ready = False
         self._report_waiting: DetectionReport | None = None
         self._last_report: DetectionReport | None = None
         self._last_verdict: dict[str, Any] = {}
@@ -191,9 +192,10 @@ class Interception:
 
     def mav_state(self, now_ns: int) -> MavState:
         """Return what our HEARTBEAT says: BOOT until all inputs were good once, then ACTIVE or CRITICAL."""
-        if self.switch.not_ready(now_ns) is None:
+        if self.switch.not_ready(now_ns) is None and not self._heartbeat_lost:
+            self._was_ready = True
             return MavState.ACTIVE
-        return MavState.BOOT if not self.statistics.detections else MavState.CRITICAL
+        return MavState.CRITICAL if self._was_ready else MavState.BOOT
 
     def announce(self) -> None:
         """Log and send what the switch S has to say."""

@@ -37,6 +37,8 @@ _HEALTH_PERIOD_NS: Final = 100_000_000
 _HEARTBEAT_PERIOD_NS: Final = 1_000_000_000
 _HEALTH_LATE_NS: Final = 1_000_000_000
 """Health that has not run for this long means that this process does not work: no HEARTBEAT then."""
+_RATE_BACK: Final = 1.2
+"""A frame rate that fell below the floor counts as back at this multiple of it: one at the floor must not flap."""
 _REOPEN_DELAYS_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 
 
@@ -61,6 +63,8 @@ class Service:
         self._health_ns = clock.now_ns()
         self._last_frame_ns: int | None = None
         self._source_fault: str | None = "no frame yet"
+        self._too_slow = False
+        self._report_failure = ""
 
     def stop(self) -> None:
         """End the service; :meth:`run` returns soon after."""
@@ -87,7 +91,7 @@ class Service:
             proxy = InlineProxy(planner, autopilot, flight, now_ns=clock.now_ns)
 
             def on_report(report: DetectionReport) -> None:
-                flight.on_report(report, clock.now_ns())
+                self._take_report(flight, report)
 
             vision = VisionSupervisor(
                 config.detector, config.camera, clock=clock, on_report=on_report, log=log
@@ -115,6 +119,15 @@ class Service:
             finally:
                 log.info("summary", **flight.statistics.summary(), **proxy.counters.as_dict())
                 log.info("service_stopped")
+
+    def _take_report(self, flight: Interception, report: DetectionReport) -> None:
+        """Hand on a report. What fails there must not end the process in flight: to the switch S vision is silent."""
+        try:
+            flight.on_report(report, self._clock.now_ns())
+        except Exception as error:  # noqa: BLE001  whatever fails there, setpoints must go on being decided
+            if repr(error) != self._report_failure:  # once, not at the rate of the frames
+                self._report_failure = repr(error)
+                self._log.exception("report_failed", frame_seq=report.frame_seq)
 
     # ------------------------------------------------------------------ loops
 
@@ -158,10 +171,12 @@ class Service:
             now_ns = clock.now_ns()
             camera = self._source_fault
             if camera is None and self._last_frame_ns is not None:
-                rate_hz = flight.statistics.frames.rate_hz(now_ns)
+                floor_hz = config.source.min_rate_hz * (_RATE_BACK if self._too_slow else 1.0)
+                slow = flight.statistics.frames.rate_hz(now_ns) < floor_hz
+                self._too_slow = slow and now_ns - started_ns > 3e9
                 if now_ns - self._last_frame_ns > config.source.timeout_s * 1e9:
                     camera = "no frames from the camera"
-                elif now_ns - started_ns > 3e9 and rate_hz < config.source.min_rate_hz:
+                elif self._too_slow:
                     camera = "frame rate below the floor"
             flight.set_fault("camera", camera, now_ns)
             status = vision.status

@@ -95,7 +95,6 @@ class Flight:
         self.min_clearance = math.inf
         self.frames: list[tuple[int, float, float, float, float]] = []
         self.offset = (0.0, 0.0)  # of the estimate against the truth
-        self.estimate_resets = 0
 
     @property
     def state(self) -> State:
@@ -134,11 +133,18 @@ class Flight:
         azimuths = [wrap_rad(self.yaw + math.radians(a)) for a in range(-33, 34, 3)]
         hits = [_ray_hit(self.n, self.e, a, self.walls) for a in azimuths]
         free = [swept_m(self.n, self.e, a, self.walls) for a in azimuths]
+        earlier_ns = partner[0]
         bearings = tuple(BearingRange(a, f, 0.02 * f, 10) for a, f in zip(azimuths, free, strict=True))
         if len({which for _, which in hits}) == 1:
             ahead = _ray_hit(self.n, self.e, self.yaw, self.walls)[0]
             return DetectionReport(
-                seq, self.now, "single_plane", pose=self.pose(), distance_m=ahead, bearings=bearings
+                seq,
+                self.now,
+                "single_plane",
+                pose=self.pose(),
+                distance_m=ahead,
+                bearings=bearings,
+                earlier_frame_ns=earlier_ns,
             )
         # the middle of the plateau of the furthest free bearings
         best = max(free)
@@ -152,6 +158,7 @@ class Flight:
             ray_body=(math.cos(body), math.sin(body), 0.0),
             distance_m=best,
             bearings=bearings,
+            earlier_frame_ns=earlier_ns,
         )
 
     def step(self, goal: LocalSetpoint | None, dt: float = 0.05) -> Verdict | None:

@@ -47,7 +47,11 @@ class Interception:
 
     def __init__(self, config: Config, *, identity: Identity, log: Log) -> None:
         guidance = config.guidance
-        self.switch = Switch(guidance, camera_yaw_rad=math.radians(config.camera.mount_yaw_deg))
+        self.switch = Switch(
+            guidance,
+            camera_yaw_rad=math.radians(config.camera.mount_yaw_deg),
+            vehicle_width_m=config.detector.vehicle_width_m,
+        )
         self.statistics = RunStatistics()
         self._config = config
         self._identity = identity

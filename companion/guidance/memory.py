@@ -10,18 +10,32 @@ from companion.config import GuidanceConfig
 from companion.guidance.coordinates import wrap_rad
 from companion.guidance.freshness import expiry
 from companion.guidance.observation import BearingRange, DetectionReport, Pose
+from companion.guidance.obstacles import NearObstacles
 
 _BIN_RAD = math.radians(3.0)
 _TRACK_GAP_M = 1.0
 """Two positions in a row further apart than this: what lies between was not seen to be flown."""
+_REMEMBERED_SHARE = 0.85
+"""Of the vehicle's width with its margins: less of the margin beside what was already passed."""
 _MATCH_RAD = math.radians(4.0)
 """A bearing stands for directions this close to it (half the vehicle's width at 5 m)."""
 
 
 class SeenBearings:
-    """Free distances by azimuth, as measured lately. An azimuth not in here is unknown, not free."""
+    """Free distances by azimuth, as measured lately, less what is remembered to stand in the way.
 
-    def __init__(self, limits: GuidanceConfig) -> None:
+    An azimuth not in here is unknown, not free.
+
+    Parameters
+    ----------
+    limits
+        How long a measurement is good for.
+    vehicle_width_m
+        What must fit between remembered obstacles, margins included.
+    """
+
+    def __init__(self, limits: GuidanceConfig, vehicle_width_m: float) -> None:
+        self._near = NearObstacles(_REMEMBERED_SHARE * vehicle_width_m / 2)
         # A bearing is a direction in the world: turning the vehicle does not make it worse, so only the
         # limits on distance and age count here.
         self._limits = limits.model_copy(update={"redetect_yaw_deg": 180.0})
@@ -30,11 +44,13 @@ class SeenBearings:
     def clear(self) -> None:
         """Forget everything."""
         self._by_bin.clear()
+        self._near.clear()
 
     def add(self, report: DetectionReport) -> None:
-        """Take the bearings of one report; a newer measurement replaces the older one of its azimuth."""
+        """Take the bearings and obstacles of one report; a newer measurement replaces the older one of its azimuth."""
         if report.pose is None:
             return
+        self._near.add(report)
         for bearing in report.bearings:
             self._by_bin[round(bearing.azimuth_rad / _BIN_RAD)] = (bearing, report)
 
@@ -42,9 +58,9 @@ class SeenBearings:
         """Return the free distance from the vehicle along an azimuth, or None where it is not known.
 
         The least of the fresh measurements within 4 degrees, less their spread and less the way flown
-        along the azimuth since.
+        along the azimuth since; not beyond a remembered obstacle.
         """
-        found: float | None = None
+        found = self._near.free_m(azimuth_rad, pose, now_ns)
         for bearing, report in self._fresh(pose, speed_m_s, now_ns):
             if abs(wrap_rad(bearing.azimuth_rad - azimuth_rad)) > _MATCH_RAD:
                 continue
@@ -60,6 +76,8 @@ class SeenBearings:
             (bearing.azimuth_rad, _remaining_m(bearing, report, pose))
             for bearing, report in self._fresh(pose, speed_m_s, now_ns)
         ]
+        remembered = {azimuth: self._near.free_m(azimuth, pose, now_ns) for azimuth, _ in fresh}
+        fresh = [(a, m if (near_m := remembered[a]) is None else min(m, near_m)) for a, m in fresh]
         free = [
             (azimuth, min(m for other, m in fresh if abs(wrap_rad(other - azimuth)) <= _MATCH_RAD))
             for azimuth, _ in fresh

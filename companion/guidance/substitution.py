@@ -144,9 +144,13 @@ class Switch:
         Limits and distances.
     camera_yaw_rad
         Azimuth of the camera's axis relative to the body's forward axis (its mounting).
+    vehicle_width_m
+        With margins: what must fit between remembered obstacles.
     """
 
-    def __init__(self, config: GuidanceConfig, *, camera_yaw_rad: float = 0.0) -> None:
+    def __init__(
+        self, config: GuidanceConfig, *, camera_yaw_rad: float = 0.0, vehicle_width_m: float = 0.9
+    ) -> None:
         self._config = config
         self._camera_yaw_rad = camera_yaw_rad
         self._state = State.DISENGAGED
@@ -174,7 +178,7 @@ class Switch:
         self._votes: deque[DetectionReport | None] = deque(maxlen=config.wall_n)
         self._answers_after_ns = -(1 << 62)
         self._pairs_after_ns = -(1 << 62)
-        self._seen = SeenBearings(config)
+        self._seen = SeenBearings(config, vehicle_width_m)
         self._track = Track()
         self._episode: Episode | None = None
         self._anchor: tuple[float, float] | None = None
@@ -627,7 +631,10 @@ class Switch:
                 bearing = math.atan2(self._goal[1] - pose.east_m, self._goal[0] - pose.north_m)
                 to_goal = wrap_rad(bearing - look)
             episode.side = -1 if to_goal < -math.radians(5.0) else 1
-        self._turn_target_rad = wrap_rad(look + episode.side * math.radians(self._config.turn_step_deg))
+        # From where the last turn was to end, not from where it was found done: twelve steps of 30 are 360.
+        goes_on = episode.sweep_rad > 0 and abs(wrap_rad(self._turn_target_rad - look)) <= 2 * _TURN_DONE_RAD
+        start = self._turn_target_rad if goes_on else look
+        self._turn_target_rad = wrap_rad(start + episode.side * math.radians(self._config.turn_step_deg))
 
     def _begin_probe(self, pose: Pose, now_ns: int) -> None:
         """Choose where to step, and take only answers from now on: those before were at another heading."""
@@ -789,7 +796,10 @@ class Switch:
         if since_ns <= _COMMAND_RECENT_NS:
             lead = wrap_rad(self._commanded_yaw_rad - heading)
             start += max(-_MAX_YAW_LEAD_RAD, min(_MAX_YAW_LEAD_RAD, lead))
-        cap = math.radians(self._config.yaw_rate_deg_s) * min(since_ns / 1e9, _MAX_SLEW_DT_S)
+        # A planner of 1-2 Hz is slow, not new: it turns too. After a longer pause the first step is none.
+        paused = since_ns > self._config.planner_timeout_s * 1e9
+        dt_s = 0.0 if paused else min(since_ns / 1e9, _MAX_SLEW_DT_S)
+        cap = math.radians(self._config.yaw_rate_deg_s) * dt_s
         return wrap_rad(start + max(-cap, min(cap, wrap_rad(yaw_rad - start))))
 
     def _without_protection(self, setpoint: LocalSetpoint, fault: str, now_ns: int) -> Verdict:

@@ -184,6 +184,7 @@ class VoidPipeline:
             y_px=None if point_px is None else point_px[1],
             ray_body=ray_body,
             pose=pose,
+            earlier_frame_ns=observation.earlier_time_ns,
             baseline_m=_finite_or_none(observation.baseline_m),
             time_to_contact_frames=None if contact is None else _finite_or_none(contact.frames),
             distance_m=distance_m,

@@ -134,6 +134,11 @@ class Flight:
         hits = [_ray_hit(self.n, self.e, a, self.walls) for a in azimuths]
         free = [swept_m(self.n, self.e, a, self.walls) for a in azimuths]
         earlier_ns = partner[0]
+        obstacles = tuple(
+            (self.n + self.offset[0] + d * math.cos(a), self.e + self.offset[1] + d * math.sin(a))
+            for a, (d, which) in zip(azimuths, hits, strict=True)
+            if which >= 0 and d <= 3.0
+        )
         bearings = tuple(BearingRange(a, f, 0.02 * f, 10) for a, f in zip(azimuths, free, strict=True))
         if len({which for _, which in hits}) == 1:
             ahead = _ray_hit(self.n, self.e, self.yaw, self.walls)[0]
@@ -144,6 +149,7 @@ class Flight:
                 pose=self.pose(),
                 distance_m=ahead,
                 bearings=bearings,
+                obstacles=obstacles,
                 earlier_frame_ns=earlier_ns,
             )
         # the middle of the plateau of the furthest free bearings
@@ -158,6 +164,7 @@ class Flight:
             ray_body=(math.cos(body), math.sin(body), 0.0),
             distance_m=best,
             bearings=bearings,
+            obstacles=obstacles,
             earlier_frame_ns=earlier_ns,
         )
 

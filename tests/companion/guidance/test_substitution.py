@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.config import GuidanceConfig
-from companion.guidance.coordinates import wrap_rad
+from companion.guidance.coordinates import heading_rad, wrap_rad
 from companion.guidance.observation import DetectionReport
 from companion.guidance.setpoint import Drop, Forward, Rewrite
 from companion.guidance.substitution import State
@@ -87,7 +87,6 @@ def test_a_dead_end_is_never_hit_and_ends_in_an_announced_hold():
     flight.fly(setpoint(10, 0), 400)
     assert "TURN" in flight.states()
     assert flight.min_clearance > 0.25
-    assert flight.state in (State.HOLD, State.TURN, State.PROBE, State.STEER, State.ALIGN, State.FOLLOW)
     progress = [c for c in flight.changes if c.time_ns > flight.now - 100 * SEC]
     assert progress or flight.gave_up
 
@@ -323,10 +322,13 @@ def test_whatever_happens_steps_yaw_and_hold_stay_within_their_caps(events):
             if isinstance(verdict, Rewrite) and verdict.yaw is not None:
                 if last_yaw is not None and flight.now - last_yaw[0] <= 0.06 * SEC:
                     turned = abs(wrap_rad(verdict.yaw - last_yaw[1]))
-                    assert (
-                        turned <= math.radians(config.yaw_rate_deg_s) * 0.2 + 1e-6
-                        or flight.state is State.HOLD
+                    cap = math.radians(config.yaw_rate_deg_s) * (flight.now - last_yaw[0]) / SEC
+                    heading = heading_rad(known.q_ned_from_body)
+                    # a hold stops a turn: it commands the heading of the moment
+                    stops = (
+                        flight.state is State.HOLD and abs(wrap_rad(verdict.yaw - heading)) <= turned + cap
                     )
+                    assert turned <= cap + 1e-6 or stops
                 last_yaw = (flight.now, verdict.yaw)
             else:
                 last_yaw = None
@@ -335,14 +337,20 @@ def test_whatever_happens_steps_yaw_and_hold_stay_within_their_caps(events):
     assert flight.state is State.DISENGAGED
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.floats(-3, 3), st.floats(-7, 7), st.floats(-7, 7), st.booleans())
-def test_with_good_inputs_no_state_but_the_announced_give_up_absorbs(yaw, goal_n, goal_e, wall):
-    walls = [*room(18, 18), *([(2, -9, 2, 4)] if wall else [])]
-    flight = Flight(walls, yaw=yaw)
-    goal = setpoint(goal_n, goal_e)
-    flight.fly(goal, 200, until_m=0.5)
-    reached = math.dist((flight.n, flight.e), (goal_n, goal_e)) <= flight.config.arrive_radius_m
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(-3, 3), st.floats(-7, 7), st.floats(-7, 7))
+def test_with_good_inputs_an_empty_room_is_crossed_from_anywhere_to_anywhere(yaw, goal_n, goal_e):
+    flight = Flight(room(18, 18), yaw=yaw)
+    assert flight.fly(setpoint(goal_n, goal_e), 200, until_m=flight.config.arrive_radius_m)
+    assert flight.min_clearance > 0.2
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.5, -2.5])
+@pytest.mark.parametrize("goal", [(6.0, -3.0), (5.0, 6.0), (1.0, 1.0), (7.0, 0.0)])
+def test_with_good_inputs_no_state_but_the_announced_give_up_absorbs(yaw, goal):
+    flight = Flight([*room(18, 18), (2, -9, 2, 4)], yaw=yaw)
+    reached = flight.fly(setpoint(*goal), 120, until_m=flight.config.arrive_radius_m)
     changed_lately = flight.changes and flight.changes[-1].time_ns > flight.now - 20 * SEC
     assert reached or changed_lately or flight.gave_up
-    assert flight.min_clearance > 0.2
+    changes_per_s = len(flight.changes) / (flight.now / SEC - 10)
+    assert changes_per_s < 2

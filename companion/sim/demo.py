@@ -51,7 +51,7 @@ DEMO_ROOM: Final = partial(room_with_wall, 12.0, 8.0, wall_north_m=4.5, gap_m=3.
 _ROOM_IMAGE_PX: Final = (320, 240)
 _ROOM_HFOV_DEG: Final = 75.0
 _ROOM_GOAL: Final = Waypoint(8.0, 0.0, _ALTITUDE_DOWN_M)
-_ROOM_TIME_S: Final = 50.0
+_ROOM_TIME_S: Final = 55.0
 _ARRIVED_M: Final = 0.5
 
 

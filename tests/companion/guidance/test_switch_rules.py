@@ -625,3 +625,151 @@ def test_a_silent_planners_goal_is_forgotten():
     assert bench.switch.reason == "gave up: camera gone"
     bench.ask(AHEAD, 1.5)
     assert bench.switch.reason == "camera gone"
+
+
+def test_agreement_is_lost_later_than_it_is_found():
+    limit = math.radians(CONFIG.agree_deg)
+    within = limit + math.radians(CONFIG.agree_hysteresis_deg) / 2
+    bench = started()
+    bench.void(within)
+    bench.ask(AHEAD)
+    assert bench.state is State.STEER
+    bench = started()
+    bench.void(0.9 * limit)
+    bench.ask(AHEAD)
+    bench.void(within)
+    bench.ask(AHEAD)
+    assert bench.state is State.FOLLOW
+
+
+def test_single_bad_pictures_between_good_answers_do_not_add_up():
+    bench = started()
+    for _ in range(2 * CONFIG.bad_reports_to_hold):
+        bench.void(0.0)
+        bench.report("none", reason="blurred")
+        bench.ask(AHEAD)
+        assert bench.state is State.FOLLOW
+
+
+@pytest.mark.parametrize("why", ["fault", "mode left", "estimator reset"])
+def test_bearings_seen_free_and_the_track_are_not_used_after(why):
+    bench = started(config=GuidanceConfig(bootstrap_probe=False))
+    for _ in range(10):
+        bench.ask(AHEAD)
+        bench.n += 0.1
+    bench.void(0.0, {0.5: 6.0})
+    match why:
+        case "fault":
+            bench.switch.set_fault("camera", "camera gone", bench.now)
+            bench.switch.set_fault("camera", None, bench.now)
+        case "mode left":
+            bench.switch.on_vehicle(armed=True, offboard=False, now_ns=bench.now)
+            bench.switch.on_vehicle(armed=True, offboard=True, now_ns=bench.now)
+        case "estimator reset":
+            bench.switch.on_estimator_reset(bench.now, "test")
+    sent = None
+    for _ in range(60):
+        bench.report("none", reason="no_motion")
+        verdict = bench.ask(setpoint(9, 1))
+        if bench.state is State.PROBE:
+            sent = wrap_rad(math.atan2(verdict.y - bench.e, verdict.x - bench.n))
+            break
+    # after a fault the track is still a way that was flown; after the others it is not known
+    assert sent == (pytest.approx(math.pi) if why == "fault" else None)
+
+
+def test_steering_turns_the_camera_and_not_the_nose_to_the_void():
+    bench = started(camera_yaw_rad=0.8)
+    bench.yaw = -0.8
+    azimuth = math.radians(18)
+    bench.void(azimuth)
+    for _ in range(60):
+        bench.report("none", reason="no_motion")
+        bench.yaw = bench.ask(AHEAD).yaw
+    assert bench.state is State.STEER
+    assert wrap_rad(bench.yaw + 0.8) == pytest.approx(azimuth)
+
+
+def test_a_void_and_a_bearing_that_are_both_measured_near_count_as_a_wall():
+    bench = started()
+    for _ in range(CONFIG.wall_k):
+        bench.ask(AHEAD)
+        bench.void(math.radians(20), {0.0: 0.5, math.radians(20): 0.6})
+    bench.ask(AHEAD)
+    assert (bench.state, bench.switch.reason) == (State.TURN, "no way ahead")
+
+
+def test_a_vehicle_that_does_not_turn_is_announced_and_a_turn_goes_on_by_time():
+    bench = started()
+    for _ in range(200):
+        bench.report("none", reason="no_motion")
+        bench.ask(setpoint(-8, 1), 0.1)
+    assert "the vehicle does not turn" in [c.reason for c in bench.changes]
+    bench = started()
+    for _ in range(3):
+        bench.wall(1.0)
+    for _ in range(80):
+        bench.report("none", reason="no_motion")
+        bench.ask(AHEAD, 0.1)
+    assert State.PROBE in [c.state for c in bench.changes]
+
+
+def test_after_the_committed_distance_it_looks_towards_the_goal_again_and_not_before():
+    bench = started(config=GuidanceConfig(redetect_distance_m=5.0, episode_distance_m=1.0))
+    bench.void(math.radians(18))
+    goal = setpoint(3, 0)
+    bench.ask(goal)
+    assert bench.state is State.STEER
+    bench.n, bench.e, bench.yaw = 1.2, 0.6, 0.35
+    bench.void(0.5)
+    bench.ask(setpoint(3, -1.0))
+    assert bench.state is State.STEER
+    bench.n, bench.e = 1.5, 0.9
+    bench.void(0.5)
+    bench.ask(setpoint(3, -1.0))
+    assert (bench.state, bench.switch.reason) == (State.ALIGN, "looking towards the goal again")
+
+
+def test_without_a_way_on_there_is_no_commitment():
+    bench = started(config=GuidanceConfig(redetect_distance_m=5.0, episode_distance_m=1.0))
+    bench.void(math.radians(18))
+    bench.ask(setpoint(3, 0))
+    bench.n, bench.e, bench.yaw = 1.2, 0.6, 0.35
+    bench.void(0.5, {0.5: 0.6})
+    bench.ask(setpoint(3, -1.0))
+    assert (bench.state, bench.switch.reason) == (State.ALIGN, "goal out of view")
+
+
+def test_a_bearing_found_blocked_is_not_looked_at_again_in_its_episode():
+    bench = started()
+    bench.void(math.radians(20))
+    bench.ask(AHEAD)
+    assert bench.state is State.STEER
+    bench.n, bench.e, bench.yaw = 1.0, 1.4, math.radians(40)  # further than what one is committed to
+    bench.void(math.radians(40))
+    bench.ask(AHEAD)
+    assert bench.state is State.STEER
+
+
+def test_a_blind_step_is_made_once_at_a_heading():
+    bench = started(config=GuidanceConfig(give_up_s=600))
+    headings: list[float] = []
+    for _ in range(3000):
+        bench.report("none", reason="no_motion")
+        verdict = bench.ask(AHEAD)
+        if verdict.yaw is not None:
+            bench.yaw = verdict.yaw
+        if bench.state is State.PROBE and (not headings or headings[-1] != bench.switch._probe_yaw_rad):
+            headings.append(bench.switch._probe_yaw_rad)
+    assert len(headings) >= 6
+    least = math.radians(CONFIG.turn_step_deg) / 2
+    for i, one in enumerate(headings):
+        assert all(abs(wrap_rad(one - other)) > least - 1e-6 for other in headings[:i])
+
+
+def test_a_far_plane_comes_nearer_as_it_is_flown_to():
+    bench = started()
+    bench.wall(2.7)
+    assert bench.reach(bench.ask(AHEAD)) == pytest.approx(CONFIG.max_step_m)
+    bench.n = 0.8
+    assert bench.reach(bench.ask(AHEAD)) == pytest.approx(2.7 - 0.8 - CONFIG.step_margin_m)

@@ -46,6 +46,17 @@ class SeenBearings:
         self._by_bin.clear()
         self._near.clear()
 
+    def forget_ranges(self) -> None:
+        """Forget what was measured free; what was seen to stand somewhere is still taken to stand there."""
+        self._by_bin.clear()
+
+    def is_measured(self, azimuth_rad: float, pose: Pose, speed_m_s: float, now_ns: int) -> bool:
+        """Whether an azimuth was measured lately; a remembered obstacle alone says nothing of the way to it."""
+        return any(
+            abs(wrap_rad(bearing.azimuth_rad - azimuth_rad)) <= _MATCH_RAD
+            for bearing, _ in self._fresh(pose, speed_m_s, now_ns)
+        )
+
     def add(self, report: DetectionReport) -> None:
         """Take the bearings and obstacles of one report; a newer measurement replaces the older one of its azimuth."""
         if report.pose is None:

@@ -260,6 +260,7 @@ class Switch:
         self._pose = None
         self._drop_measurements(now_ns)
         self._pairs_after_ns = now_ns
+        self._seen.clear()
         self._track.clear()
         self._episode = None
         self._anchor = None
@@ -459,7 +460,11 @@ class Switch:
         step_m = min(s.goal_m, self._config.max_step_m)
         if self._state is State.FOLLOW:
             step_m *= _MEASURED_FREE_FACTOR
-        return s.free_bearing_m is not None and s.free_bearing_m - self._config.step_margin_m >= step_m
+        return (
+            s.free_bearing_m is not None
+            and s.free_bearing_m - self._config.step_margin_m >= step_m
+            and self._seen.is_measured(s.bearing_rad, s.pose, s.speed_m_s, s.now_ns)
+        )
 
     def _choose(self, s: _Situation) -> tuple[State, str]:
         """Return the state that the situation asks for, whatever the present one."""
@@ -874,7 +879,7 @@ class Switch:
     def _drop_measurements(self, now_ns: int) -> None:
         self._answer = None
         self._votes.clear()
-        self._seen.clear()
+        self._seen.forget_ranges()
         self._answers_after_ns = now_ns
 
     def _forget_flight(self) -> None:

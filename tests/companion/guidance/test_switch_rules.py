@@ -773,3 +773,22 @@ def test_a_far_plane_comes_nearer_as_it_is_flown_to():
     assert bench.reach(bench.ask(AHEAD)) == pytest.approx(CONFIG.max_step_m)
     bench.n = 0.8
     assert bench.reach(bench.ask(AHEAD)) == pytest.approx(2.7 - 0.8 - CONFIG.step_margin_m)
+
+
+def test_a_remembered_obstacle_far_ahead_does_not_make_the_way_to_it_measured():
+    bench = started()
+    for _ in range(3):
+        bench.void(math.radians(20), {math.radians(20): 6.0}, obstacles=((4.0, 0.0),))
+    verdict = bench.ask(AHEAD)
+    assert bench.state is State.STEER
+    assert verdict.y > 0.0
+
+
+def test_what_stands_nearby_is_not_forgotten_over_a_fault():
+    bench = started()
+    for _ in range(3):
+        bench.void(0.0, obstacles=((1.5, 0.0),))
+    bench.switch.set_fault("camera", "camera gone", bench.now)
+    bench.switch.set_fault("camera", None, bench.now)
+    bench.void(0.0)
+    assert bench.reach(bench.ask(AHEAD)) <= 1.5 - CONFIG.step_margin_m + 1e-9

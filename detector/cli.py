@@ -1,79 +1,314 @@
-"""Command line of the detector: ``detector detect A B``."""
+"""Command line of the detector: ``detector detect A B``.
+
+Each sub-command is one ``_add_...`` function that describes its options and names the function to run. OpenCV and the
+detector itself are imported there, when a command runs, so that ``--help`` answers at once.
+"""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import json
+import math
 import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from detector.camera_model import CameraError, CameraModel
-from detector.overlay import caption, draw
-from detector.params import DetectorParams, ParamsError
-from detector.pipeline import PairResult, VoidDetector
 from detector.results import Detection, Direction, NoDetection
 
-_EPILOG = """\
-The rotation file holds the 3 x 3 rotation that takes coordinates of the earlier camera to those of the later one
-(x right, y down, z forward), as TOML or JSON:
-    later_from_earlier = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-It needs --hfov or --camera. In JSON the bare 3 x 3 list will do.
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-Exit code 0: an answer, which may be "none" with its reason (frames of different sizes are "none: wrong_size");
-2: the command or a file cannot be used.
+    from detector.camera_model import CameraModel
+    from detector.pipeline import PairResult
+
+EXIT_OK: Final = 0
+"""There is an answer, which may be "none" with its reason."""
+EXIT_BAD_INPUT: Final = 2
+"""The command line, or a file that it names, cannot be used (also argparse's own code)."""
+
+_DETECT_DESCRIPTION: Final = """\
+Find the void (the way that is furthest from obstacles), or a single plane, in two frames of one camera that moved.
 """
+
+_DETECT_EPILOG: Final = """\
+rotation file
+  The 3 x 3 rotation that takes coordinates of the earlier camera to those of the later one (x right, y down,
+  z forward), as TOML
+      later_from_earlier = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+  or as JSON
+      {"later_from_earlier": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+  With camera-to-world rotations Ra and Rb it is transpose(Rb) Ra. It needs --hfov or --camera.
+
+JSON keys
+  kind        vanishing_point, lowest_flow, single_plane or none
+  x_px, y_px  the direction, in the later frame; null unless kind is vanishing_point or lowest_flow
+  reason, detail
+              why there is none; else null
+  time_to_contact_frames, time_to_contact_spread_frames, time_to_contact_samples
+              in steps of the pair's length, counted from the later frame; null where it is not known
+  distance_m, distance_spread_m
+              the same in metres, with --baseline; else null
+  diagnostics what every step found
+
+exit code
+  0  an answer, which may be "none" with its reason (frames that differ in size are none, wrong_size)
+  2  the command line or a file that it names cannot be used; one line on stderr says which and why
+"""
+
+_LEGIBLE_WIDTH_PX: Final = 480
+"""Narrower frames are plotted enlarged: text at their own size could not be read."""
+_MAX_BASELINE_M: Final = 1000.0
+_ROTATION_TOLERANCE: Final = 1e-3
+"""Files hold rounded figures: R transpose(R) may differ from the identity by this much."""
+_LARGE: Final = 1e6
+"""No entry of anything like a rotation is as large; NaN and whole numbers too long for a float fail the comparison too."""
+_MAX_ZOOM: Final = 8
 
 
 class InputError(Exception):
-    """The command line or a file that it names cannot be used; the message is for the user."""
+    """The command line, or a file that it names, cannot be used; the message is one line for the user."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit code: 0, or 2 with one clear message on stderr."""
+    """Run a command and return its exit code: 0, or 2 with one clear line on stderr.
+
+    Parameters
+    ----------
+    argv
+        Arguments without the program's name; those of the process when not given.
+
+    Raises
+    ------
+    SystemExit
+        From argparse: after ``--help`` (0), and on a command line that it cannot parse (2).
+    """
     options = _parser().parse_args(argv)
     try:
-        return _detect(options)
-    except (InputError, ParamsError, CameraError) as error:
-        print(f"detector: {error}", file=sys.stderr)
-        return 2
+        code: int = options.run(options)
+    except InputError as error:
+        print(f"detector: error: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    return code
 
 
 def as_dict(result: PairResult, baseline_m: float | None = None) -> dict[str, Any]:
-    """Return the answer as plain values, the keys of ``--json``.
+    """Return an answer as plain values that JSON can hold: the keys of ``--json``, see ``detector detect --help``.
 
     Parameters
     ----------
     result
         Answer of the pipeline.
     baseline_m
-        Metres flown between the frames; adds ``distance_m`` where a time to contact is known.
+        Metres flown between the two frames.
     """
     detection = result.detection
     direction = detection if isinstance(detection, Direction) else None
+    silence = detection if isinstance(detection, NoDetection) else None
     contact = None if isinstance(detection, NoDetection) else detection.time_to_contact
-    answer: dict[str, Any] = {
+    distance_m = spread_m = None
+    if contact is not None and baseline_m is not None:
+        distance_m, spread_m = contact.frames * baseline_m, contact.spread_frames * baseline_m
+    answer = {
         "kind": _kind(detection),
         "x_px": None if direction is None else direction.x_px,
         "y_px": None if direction is None else direction.y_px,
-        "reason": detection.reason.value if isinstance(detection, NoDetection) else None,
-        "detail": detection.detail if isinstance(detection, NoDetection) else None,
+        "reason": None if silence is None else silence.reason.value,
+        "detail": None if silence is None else silence.detail,
         "time_to_contact_frames": None if contact is None else contact.frames,
         "time_to_contact_spread_frames": None if contact is None else contact.spread_frames,
         "time_to_contact_samples": None if contact is None else contact.samples,
+        "distance_m": distance_m,
+        "distance_spread_m": spread_m,
+        "diagnostics": dataclasses.asdict(detection.diagnostics),
     }
-    if baseline_m is not None:
-        answer["distance_m"] = None if contact is None else contact.frames * baseline_m
-        answer["distance_spread_m"] = None if contact is None else contact.spread_frames * baseline_m
-    answer["diagnostics"] = dataclasses.asdict(detection.diagnostics)
-    return answer
+    cleaned: dict[str, Any] = _json_clean(answer)
+    return cleaned
+
+
+# ---------------------------------------------------------------------- commands
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="detector",
+        description="Void detection for indoor drones, from optical flow and vanishing points of one camera.",
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for add in (_add_detect,):
+        add(commands)
+    return parser
+
+
+def _add_detect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "detect",
+        help="answer for one pair of images",
+        description=_DETECT_DESCRIPTION,
+        epilog=_DETECT_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("earlier", type=Path, metavar="A", help="the earlier image")
+    parser.add_argument("later", type=Path, metavar="B", help="the later image")
+    parser.add_argument(
+        "--preset", default="default", metavar="NAME", help="default or paper (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--params", type=Path, metavar="FILE", help="TOML file with parameters that replace the preset's"
+    )
+    cameras = parser.add_mutually_exclusive_group()
+    cameras.add_argument(
+        "--hfov", type=float, metavar="DEG", help="horizontal field of view of a camera without distortion"
+    )
+    cameras.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="TOML camera file: width_px, height_px, and hfov_deg or fx_px, fy_px, cx_px, cy_px, distortion",
+    )
+    parser.add_argument(
+        "--rotation", type=Path, metavar="FILE", help="known rotation between the frames, see below"
+    )
+    parser.add_argument("--baseline", type=_metres, metavar="M", help="metres flown between the two frames")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write the annotated later frame")
+    parser.set_defaults(run=_run_detect)
+
+
+def _run_detect(options: argparse.Namespace) -> int:
+    from detector.pipeline import VoidDetector
+
+    params = _params(options)
+    earlier, later = _read_image(options.earlier), _read_image(options.later)
+    camera, rotation = _camera(options, later), None
+    if options.rotation is not None:
+        if options.hfov is None and options.camera is None:
+            raise InputError("--rotation: needs the camera too, as --hfov DEG or --camera FILE")
+        given = _read_rotation(options.rotation)
+        rotation = None if camera is None else given
+    result = VoidDetector(params).detect(earlier, later, camera=camera, later_from_earlier=rotation)
+    if options.plot is not None:
+        _plot(options.plot, later, result)
+    answer = as_dict(result, options.baseline)
+    print(json.dumps(answer, allow_nan=False) if options.json else _text(result, answer))
+    return EXIT_OK
+
+
+# ---------------------------------------------------------------------- input
+
+
+def _params(options: argparse.Namespace) -> Any:
+    from detector.params import DetectorParams, ParamsError
+
+    try:
+        if options.params is None:
+            return DetectorParams.preset(options.preset)
+        return DetectorParams.from_toml(options.params, options.preset)
+    except ParamsError as error:
+        raise InputError(_one_line(error)) from error
+
+
+def _camera(options: argparse.Namespace, later: NDArray[np.uint8]) -> CameraModel | None:
+    """Return the camera that the options describe, scaled to the frames where they have its shape.
+
+    None where none is described, and for a frame too small for any camera, whose answer is wrong_size in any case.
+    """
+    from detector.camera_model import CameraError, CameraModel
+
+    height_px, width_px = later.shape
+    try:
+        if options.hfov is not None:
+            least_px = 16  # of a camera's side
+            camera = CameraModel.from_hfov(max(width_px, least_px), max(height_px, least_px), options.hfov)
+            return camera if min(width_px, height_px) >= least_px else None
+        if options.camera is None:
+            return None
+        camera = CameraModel.from_file(options.camera)
+        same_shape = abs(width_px * camera.height_px - height_px * camera.width_px) <= max(camera.width_px, 1)
+        if same_shape and (width_px, height_px) != (camera.width_px, camera.height_px):
+            return camera.scaled_to(width_px, height_px)
+    except CameraError as error:
+        prefix = "--hfov: " if options.hfov is not None else ""
+        raise InputError(_one_line(f"{prefix}{error}")) from error
+    return camera
+
+
+def _read_image(path: Path) -> NDArray[np.uint8]:
+    import cv2
+    import numpy as np
+
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise InputError(f"{path}: cannot be read: {_cause(error)}") from error
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    except cv2.error as error:  # a header that promises absurd sizes
+        raise InputError(f"{path}: is not an image that can be decoded") from error
+    if image is None:
+        raise InputError(f"{path}: is not an image that can be decoded")
+    return np.asarray(image, np.uint8)
+
+
+def _read_rotation(path: Path) -> NDArray[np.float64]:
+    import numpy as np
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text in UTF-8") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {_cause(error)}") from error
+    try:
+        table: Any = json.loads(text) if text.lstrip().startswith("{") else tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(_one_line(f"{path}: is not valid TOML or JSON: {error}")) from error
+    if set(table) != {"later_from_earlier"}:
+        found = ", ".join(sorted(table)) or "no key"
+        raise InputError(_one_line(f"{path}: found {found}, allowed is later_from_earlier alone"))
+    rows = table["later_from_earlier"]
+    is_matrix = isinstance(rows, list) and len(rows) == 3 and all(_is_row(row) for row in rows)
+    if not is_matrix:
+        raise InputError(f"{path}: later_from_earlier: found {_short(rows)}, allowed are 3 rows of 3 numbers")
+    rotation = np.array(rows, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not off <= _ROTATION_TOLERANCE:
+        raise InputError(
+            f"{path}: later_from_earlier: is not a rotation: rows must be of length 1 and perpendicular, they are off by {off:.3g}"
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise InputError(f"{path}: later_from_earlier: is a reflection, its determinant must be +1")
+    return rotation
+
+
+def _is_row(row: object) -> bool:
+    return (
+        isinstance(row, list)
+        and len(row) == 3
+        and all(
+            isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGE
+            for value in row
+        )
+    )
+
+
+def _metres(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= _MAX_BASELINE_M:
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, allowed are metres above 0 and up to {_MAX_BASELINE_M:g}"
+        )
+    return value
+
+
+# ---------------------------------------------------------------------- output
 
 
 def _kind(detection: Detection) -> str:
@@ -82,154 +317,73 @@ def _kind(detection: Detection) -> str:
     return detection.kind.value if isinstance(detection, Direction) else "single_plane"
 
 
-def _detect(options: argparse.Namespace) -> int:
-    earlier, later = _read_image(options.earlier), _read_image(options.later)
-    if options.params is None:
-        params = DetectorParams.preset(options.preset)
-    else:
-        params = DetectorParams.from_toml(options.params, options.preset)
-    camera: CameraModel | None = None
-    if options.camera is not None:
-        camera = CameraModel.from_file(options.camera)
-    elif options.hfov is not None:
-        if min(later.shape) < 16:
-            raise InputError(
-                f"{options.later}: {later.shape[1]} x {later.shape[0]} px is too small for a camera"
-            )
-        camera = CameraModel.from_hfov(later.shape[1], later.shape[0], options.hfov)
-    rotation: NDArray[np.float64] | None = None
-    if options.rotation is not None:
-        if camera is None:
-            raise InputError("--rotation needs --hfov or --camera")
-        rotation = _read_rotation(options.rotation)
-    result = VoidDetector(params).detect(earlier, later, camera=camera, later_from_earlier=rotation)
-    answer = as_dict(result, options.baseline)
-    if options.plot is not None:
-        _write_image(options.plot, draw(later, result.detection, result.tracks))
-    print(json.dumps(answer, allow_nan=False) if options.json else _text(result, answer))
-    return 0
-
-
 def _text(result: PairResult, answer: dict[str, Any]) -> str:
-    diagnostics = result.detection.diagnostics
-    rows = [caption(result.detection)]
+    """Return an answer for people: what it is first, how it came about below."""
+    from detector.overlay import headline
+
+    seen = result.detection.diagnostics
+    rows: list[tuple[str, str]] = []
     if answer["detail"]:
-        rows.append(f"  {answer['detail']}")
-    if answer.get("distance_m") is not None:
-        rows.append(f"  distance {answer['distance_m']:.2f} +- {answer['distance_spread_m']:.2f} m")
-    rows.append(f"  key points {diagnostics.n_features_earlier}, {diagnostics.n_features_later}")
-    rows.append(
-        f"  flow vectors N {diagnostics.n_tracks}, N' {diagnostics.n_after_distribution}, "
-        f"N'' {diagnostics.n_after_length}, N''' {diagnostics.n_after_angle}"
-    )
-    if diagnostics.n is not None and diagnostics.plane_statistic is not None:
-        rows.append(f"  p {diagnostics.p}, n {diagnostics.n}, k {diagnostics.k}")
-        rows.append(
-            f"  single plane: {diagnostics.plane_statistic:.2f} against {diagnostics.plane_threshold:.2f}"
-        )
-        rows.append(f"  lines {len(diagnostics.lines_px)}, candidates {len(diagnostics.candidates_px)}")
-    times = ", ".join(f"{name} {seconds * 1e3:.0f}" for name, seconds in diagnostics.seconds.items())
-    if times:
-        rows.append(f"  ms: {times}")
-    return "\n".join(rows)
+        rows.append(("why", answer["detail"]))
+    if answer["distance_m"] is not None:
+        rows.append(("distance", f"{answer['distance_m']:.2f} +- {answer['distance_spread_m']:.2f} m"))
+    if seen.n_features_earlier:
+        rows.append(("key points", f"{seen.n_features_earlier} earlier, {seen.n_features_later} later"))
+    if seen.n_tracks:
+        filtered = f"N' {seen.n_after_distribution}, N'' {seen.n_after_length}, N''' {seen.n_after_angle}"
+        rows.append(("flow vectors", f"N {seen.n_tracks}, {filtered}"))
+    if seen.n is not None:
+        rows.append(("clusters", f"p {seen.p}, n {seen.n}, k {seen.k}"))
+    if seen.plane_statistic is not None:
+        rows.append(("single plane", f"{seen.plane_statistic:.3g} against {seen.plane_threshold:.3g}"))
+    if seen.n_lines:
+        passed = f"{len(seen.lines_px)} of {seen.n_lines} by their angle"
+        rows.append(("lines", f"{passed}, {len(seen.candidates_px)} vanishing-point candidates"))
+    if seen.seconds:
+        rows.append(("time", f"{sum(seen.seconds.values()) * 1e3:.0f} ms"))
+    return "\n".join([headline(result.detection), *(f"  {name:<13} {value}" for name, value in rows)])
 
 
-def _read_image(path: Path) -> NDArray[np.uint8]:
+def _plot(path: Path, later: NDArray[np.uint8], result: PairResult) -> None:
+    import cv2
+
+    from detector.overlay import draw
+
+    zoom = min(max(1, round(_LEGIBLE_WIDTH_PX / later.shape[1])), _MAX_ZOOM)
+    picture = draw(later, result, zoom=zoom)
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-    except cv2.error as error:  # a header that promises absurd sizes
-        raise InputError(f"{path}: not an image that can be decoded") from error
-    if image is None:
-        raise InputError(f"{path}: not an image that can be decoded")
-    return np.asarray(image, np.uint8)
-
-
-def _write_image(path: Path, picture: NDArray[np.uint8]) -> None:
-    try:
-        encoded, data = cv2.imencode(path.suffix or ".png", picture)
+        done, data = cv2.imencode(path.suffix, picture)
     except cv2.error as error:
-        raise InputError(f"{path}: no image format for {path.suffix!r}, try .png") from error
-    if not encoded:
-        raise InputError(f"{path}: cannot be encoded")
+        raise InputError(
+            f"--plot {path}: found the ending {path.suffix!r}, allowed is an image format such as .png"
+        ) from error
+    if not done:
+        raise InputError(f"--plot {path}: the picture cannot be encoded as {path.suffix}")
     try:
         path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"--plot {path}: cannot be written: {_cause(error)}") from error
 
 
-def _read_rotation(path: Path) -> NDArray[np.float64]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file in UTF-8") from error
-    try:
-        found: Any = json.loads(text) if text.lstrip()[:1] in ("{", "[") else tomllib.loads(text)
-    except (json.JSONDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: neither valid TOML nor JSON: {error}") from error
-    if isinstance(found, dict):
-        if set(found) != {"later_from_earlier"}:
-            raise InputError(f"{path}: found keys {sorted(found)}, allowed is later_from_earlier alone")
-        found = found["later_from_earlier"]
-    try:
-        rotation = np.array(found, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: later_from_earlier: found {found!r}, allowed is a 3 x 3 list of numbers"
-        ) from error
-    if rotation.shape != (3, 3):
-        raise InputError(f"{path}: later_from_earlier: found shape {rotation.shape}, allowed is 3 x 3")
-    if not np.isfinite(rotation).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-        raise InputError(
-            f"{path}: later_from_earlier: found a matrix that is not orthonormal, allowed is a rotation"
-        )
-    if np.linalg.det(rotation) < 0.0:
-        raise InputError(f"{path}: later_from_earlier: found a reflection, allowed is a rotation")
-    return rotation
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"found {text!r}, allowed is a number of metres") from None
-    if not 0.0 < value < 1000.0:
-        raise argparse.ArgumentTypeError(f"found {text}, allowed are more than 0 and less than 1000 m")
+def _json_clean(value: Any) -> Any:
+    """Return the value with lists for tuples and null for figures that are not finite, which JSON has no word for."""
+    if isinstance(value, dict):
+        return {key: _json_clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_clean(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
     return value
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="detector", description="Void detection from two frames of one camera."
-    )
-    commands = parser.add_subparsers(dest="command", required=True)
-    detect = commands.add_parser(
-        "detect",
-        help="answer for one pair of images",
-        description="Find the void, or a single plane, in one pair of images.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    detect.add_argument("earlier", type=Path, metavar="A", help="the earlier image")
-    detect.add_argument("later", type=Path, metavar="B", help="the later image, of the same size")
-    detect.add_argument(
-        "--params", type=Path, metavar="FILE", help="TOML with parameters that replace the preset's"
-    )
-    detect.add_argument(
-        "--preset", default="default", metavar="NAME", help="default or paper (default: default)"
-    )
-    known = detect.add_mutually_exclusive_group()
-    known.add_argument("--hfov", type=float, metavar="DEG", help="horizontal field of view")
-    known.add_argument("--camera", type=Path, metavar="FILE", help="camera file (TOML)")
-    detect.add_argument(
-        "--rotation", type=Path, metavar="FILE", help="rotation between the frames, see below"
-    )
-    detect.add_argument("--baseline", type=_positive, metavar="M", help="metres flown between the frames")
-    detect.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    detect.add_argument("--plot", type=Path, metavar="OUT.png", help="write the annotated second frame")
-    return parser
+def _cause(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or _one_line(error)
+
+
+def _one_line(message: object) -> str:
+    return "; ".join(part.strip() for part in str(message).splitlines() if part.strip())
+
+
+def _short(value: object, limit: int = 60) -> str:
+    text = repr(value)
+    return text if len(text) <= limit else f"{text[:limit]}..."

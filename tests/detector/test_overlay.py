@@ -1,0 +1,96 @@
+"""The picture of an answer: what was found stands where it was found, and the words fit."""
+
+import numpy as np
+import pytest
+
+from detector.flow import Tracks
+from detector.overlay import draw, headline
+from detector.pipeline import PairResult
+from detector.results import (
+    Diagnostics,
+    Direction,
+    DirectionKind,
+    NoDetection,
+    NoDetectionReason,
+    SinglePlane,
+    TimeToContact,
+)
+
+NO_TRACKS = Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
+GREY = np.full((240, 320), 120, np.uint8)
+
+
+def result(detection, tracks=NO_TRACKS):
+    return PairResult(detection, tracks, None)
+
+
+def direction(x=200.0, y=150.0, kind=DirectionKind.LOWEST_FLOW, **diagnostics):
+    return Direction(x, y, kind, TimeToContact(12.0, 1.5, 30), Diagnostics(**diagnostics))
+
+
+def test_the_picture_has_the_frames_size_times_the_zoom_and_leaves_the_frame_alone():
+    before = GREY.copy()
+    assert draw(GREY, result(direction())).shape == (240, 320, 3)
+    assert draw(GREY, result(direction()), zoom=2).shape == (480, 640, 3)
+    np.testing.assert_array_equal(GREY, before)
+
+
+def test_the_direction_is_marked_where_it_is_also_at_another_zoom():
+    for zoom in (1, 3):
+        picture = draw(GREY, result(direction(200.0, 150.0)), zoom=zoom)
+        assert tuple(picture[150 * zoom + zoom // 2, 200 * zoom + zoom // 2]) == (255, 255, 255)
+
+
+@pytest.mark.parametrize(("y", "text_rows"), [(150.0, slice(0, 20)), (10.0, slice(220, 240))])
+def test_the_words_stand_where_the_direction_is_not(y, text_rows):
+    picture = draw(GREY, result(direction(160.0, y)))
+    assert (picture[text_rows] > 200).any()
+    assert tuple(picture[round(y), 160]) == (255, 255, 255)
+
+
+def test_lmcc_centres_candidates_and_lines_are_drawn_in_their_colours():
+    found = direction(
+        kind=DirectionKind.VANISHING_POINT,
+        centre_points_px=((60.0, 200.0),),
+        lmcc_px=(120.0, 120.0),
+        candidates_px=((110.0, 160.0), (300.0, 220.0)),
+        lines_px=((20.0, 100.0, 20.0, 140.0),),
+    )
+    picture = draw(GREY, result(found))
+    assert tuple(picture[200, 60]) == (60, 220, 60)  # a centre, green
+    assert tuple(picture[120, 120]) == (0, 235, 255)  # LMCC, yellow
+    assert tuple(picture[160, 104]) == (255, 255, 255)  # the elected candidate, white
+    assert tuple(picture[220, 294]) == (255, 130, 30)  # another one, blue
+    assert tuple(picture[120, 20]) == (40, 160, 255)  # a line, orange
+    rejected = Direction(200, 150, DirectionKind.LOWEST_FLOW, None, found.diagnostics)
+    assert tuple(draw(GREY, result(rejected))[160, 104]) == (60, 60, 255)  # examined, not elected: red
+
+
+def test_long_flow_has_another_colour_than_short_flow():
+    start = np.array([[50.0, 100.0], [50.0, 140.0]])
+    tracks = Tracks(start, start + np.array([[30.0, 0.0], [4.0, 0.0]]))
+    picture = draw(GREY, result(SinglePlane(None, Diagnostics()), tracks))
+    long, short = picture[100, 60].astype(int), picture[140, 52].astype(int)
+    assert long[2] > long[0]  # towards red
+    assert short[0] > short[2]  # towards blue
+
+
+def test_a_point_far_outside_and_a_tiny_frame_are_no_error():
+    draw(GREY, result(direction(1e9, -1e9, lmcc_px=(1e12, 5.0))))
+    assert draw(np.zeros((1, 1), np.uint8), result(direction(0.0, 0.0))).shape == (1, 1, 3)
+
+
+def test_headlines_say_what_it_is():
+    assert headline(direction()).startswith("lowest flow at (200, 150)")
+    assert "contact in 12.0 +- 1.5 frames" in headline(direction())
+    assert headline(SinglePlane(None, Diagnostics())) == "SINGLE PLANE, time to contact unknown"
+    nothing = NoDetection(NoDetectionReason.NO_MOTION, "", Diagnostics())
+    assert headline(nothing) == "no detection: no_motion"
+
+
+@pytest.mark.parametrize("image", [np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8), np.zeros(4, np.uint8)])
+def test_what_is_no_image_is_refused(image):
+    with pytest.raises(ValueError, match="expected"):
+        draw(image, result(direction()))
+    with pytest.raises(ValueError, match="zoom"):
+        draw(GREY, result(direction()), zoom=0)

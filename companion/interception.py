@@ -14,6 +14,7 @@ from companion.guidance.setpoint import Forward, LocalSetpoint, Rewrite, Verdict
 from companion.guidance.substitution import GaveUp, State, StateChanged, Switch
 from companion.log import Log
 from companion.mavlink.identity import Identity, MavSeverity, MavState
+from companion.mavlink.requests import EngageRequest
 from companion.mavlink.telemetry import (
     Attitude,
     AttitudeQuaternion,
@@ -23,11 +24,14 @@ from companion.mavlink.telemetry import (
     Odometry,
     Telemetry,
     Unusable,
+    VehicleMode,
     vehicle_mode,
 )
 from companion.run_statistics import RunStatistics
 
 _HEARTBEAT_LOST_NS: Final = 3_500_000_000
+_REQUEST_COUNTS_NS: Final = 1_500_000_000
+"""By then a HEARTBEAT (1 Hz) has said whether a request was carried out."""
 
 
 class Interception:
@@ -62,6 +66,9 @@ class Interception:
         self._reset_counter: int | None = None
         self._autopilot_heartbeat_ns: int | None = None
         self._heartbeat_lost = False
+        self._mode = VehicleMode(armed=False, offboard=False)
+        self._asked_to_arm_ns = -(1 << 62)
+        self._asked_for_offboard_ns = -(1 << 62)
         self._was_ready = False
         self._report_waiting: DetectionReport | None = None
         self._last_report: DetectionReport | None = None
@@ -96,6 +103,17 @@ class Interception:
         self._announced_unprotected.add(key)
         self._log.warning("setpoint_unprotected", kind=kind, detail=detail)
         self._identity.status_text(MavSeverity.WARNING, f"void: UNPROTECTED {kind} {detail}")
+
+    def on_engage_request(self, request: EngageRequest, now_ns: int) -> None:
+        """Protect from the moment that OFFBOARD or arming is asked for: the HEARTBEAT says so up to a second later.
+
+        A request that is refused holds setpoints for a second and a half that the vehicle does not follow anyway.
+        """
+        if request.arm:
+            self._asked_to_arm_ns = now_ns
+        if request.offboard:
+            self._asked_for_offboard_ns = now_ns
+        self._tell_mode(now_ns)
 
     def on_telemetry(self, message: Telemetry | Unusable, now_ns: int) -> None:
         """Take one message of the autopilot's telemetry."""
@@ -139,8 +157,14 @@ class Interception:
         if not self._identity.learn(heartbeat):
             return
         self._autopilot_heartbeat_ns = now_ns
-        mode = vehicle_mode(heartbeat)
-        self.switch.on_vehicle(armed=mode.armed, offboard=mode.offboard, now_ns=now_ns)
+        self._mode = vehicle_mode(heartbeat)
+        self._tell_mode(now_ns)
+
+    def _tell_mode(self, now_ns: int) -> None:
+        """Tell the mode of the last HEARTBEAT, ahead of it what was just asked for."""
+        armed = self._mode.armed or now_ns - self._asked_to_arm_ns <= _REQUEST_COUNTS_NS
+        offboard = self._mode.offboard or now_ns - self._asked_for_offboard_ns <= _REQUEST_COUNTS_NS
+        self.switch.on_vehicle(armed=armed, offboard=offboard, now_ns=now_ns)
         self.announce()
 
     def _on_estimator_reset(self, now_ns: int, why: str) -> None:

@@ -26,10 +26,11 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 from companion.guidance.setpoint import Drop, Forward, LocalSetpoint, Rewrite, Verdict
-from companion.mavlink import codec, telemetry
+from companion.mavlink import codec, requests, telemetry
 from companion.mavlink.framing import RawFrame
 from companion.mavlink.identity import is_autopilot
 from companion.mavlink.link import FrameReceiver, LinkCounters
+from companion.mavlink.requests import EngageRequest
 from companion.mavlink.telemetry import Heartbeat, Telemetry, Unusable
 
 _LOG: Final = logging.getLogger(__name__)
@@ -68,6 +69,10 @@ class ProxyHandler(Protocol):
 
     def on_telemetry(self, message: Telemetry | Unusable, now_ns: int) -> None:
         """Take a message of the vehicle's autopilot; it has been forwarded already."""
+        ...
+
+    def on_engage_request(self, request: EngageRequest, now_ns: int) -> None:
+        """Take note that the planner's side asks for OFFBOARD or GUIDED, or to arm; it is being forwarded."""
         ...
 
 
@@ -176,14 +181,30 @@ class InlineProxy:
 
     def _from_planner(self, frames: list[RawFrame]) -> None:
         now_ns = self._now_ns()
-        out = [
-            data
-            for frame in frames
-            if (data := frame.data if frame.message_id not in _NAMES else self._setpoint(frame, now_ns))
-        ]
+        out: list[bytes] = []
+        for frame in frames:
+            data = frame.data
+            if frame.message_id in _NAMES:
+                data = self._setpoint(frame, now_ns)
+            elif frame.message_id in requests.MESSAGE_IDS:
+                self._note_request(frame, now_ns)
+            if data:
+                out.append(data)
         if out:
             self.counters.to_autopilot_frames += len(out)
             self._autopilot.send(out[0] if len(out) == 1 else b"".join(out))
+
+    def _note_request(self, frame: RawFrame, now_ns: int) -> None:
+        """Tell the handler of a request for OFFBOARD or arming before it is sent: the HEARTBEAT says so a second late."""
+        if self._vehicle is None:
+            return
+        request = requests.engage_request(frame, self._vehicle)
+        if request is None:
+            return
+        try:
+            self._handler.on_engage_request(request, now_ns)
+        except Exception as error:  # noqa: BLE001  the request goes on whatever the handler does
+            self._handler_failed("on_engage_request", error)
 
     def _setpoint(self, frame: RawFrame, now_ns: int) -> bytes:
         """Return what is sent in place of a setpoint frame; nothing where it is dropped."""

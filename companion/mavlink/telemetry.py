@@ -140,13 +140,17 @@ def vehicle_mode(heartbeat: Heartbeat) -> VehicleMode:
     Any other autopilot, and ArduPilot on anything but a copter, never counts as taking setpoints.
     """
     armed = bool(heartbeat.base_mode & _SAFETY_ARMED)
-    offboard = False
-    if heartbeat.base_mode & _CUSTOM_MODE_ENABLED:
-        if heartbeat.autopilot == MAV_AUTOPILOT_PX4:
-            offboard = heartbeat.custom_mode >> 16 & 0xFF == _PX4_MAIN_OFFBOARD
-        elif heartbeat.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
-            offboard = heartbeat.type in _COPTER_TYPES and heartbeat.custom_mode == _COPTER_GUIDED
-    return VehicleMode(armed, offboard)
+    enabled = bool(heartbeat.base_mode & _CUSTOM_MODE_ENABLED)
+    return VehicleMode(armed, enabled and is_offboard(heartbeat, heartbeat.custom_mode))
+
+
+def is_offboard(vehicle: Heartbeat, custom_mode: int) -> bool:
+    """Return whether a custom mode is the one in which this vehicle takes setpoints."""
+    if vehicle.autopilot == MAV_AUTOPILOT_PX4:
+        return custom_mode >> 16 & 0xFF == _PX4_MAIN_OFFBOARD
+    if vehicle.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        return vehicle.type in _COPTER_TYPES and custom_mode == _COPTER_GUIDED
+    return False
 
 
 def _heartbeat(frame: RawFrame) -> Heartbeat:

@@ -16,6 +16,7 @@ from companion.guidance.setpoint import Drop, Forward, Rewrite
 from companion.guidance.substitution import State
 from companion.interception import Interception
 from companion.mavlink.identity import Identity, MavState
+from companion.mavlink.requests import EngageRequest
 from companion.mavlink.telemetry import (
     Attitude,
     AttitudeQuaternion,
@@ -315,3 +316,35 @@ def test_statistics_count_frames_reports_reasons_and_waiting_times():
     status = bench.flight.status(bench.now)
     assert status["setpoint"]["action"] == "substituted"
     assert status["report"]["age_ms"] == 30
+
+
+def test_protection_begins_with_the_request_for_offboard_not_with_the_next_heartbeat():
+    bench = Bench()
+    bench.heartbeat(mode=HOLD_MODE)
+    bench.telemetry(0.5)
+    assert isinstance(bench.flight.on_setpoint(setpoint(5, 0), 245, 190, bench.now), Forward)
+    bench.flight.on_engage_request(EngageRequest(arm=False, offboard=True), bench.now)
+    verdict = bench.flight.on_setpoint(setpoint(5, 0), 245, 190, bench.now)
+    assert isinstance(verdict, Rewrite)
+    # a heartbeat that was on its way does not end it, and the one that confirms it changes nothing
+    bench.telemetry(0.2)
+    bench.heartbeat(mode=HOLD_MODE)
+    assert bench.switch.state is not State.DISENGAGED
+    bench.heartbeat()
+    bench.telemetry(3.0)
+    bench.heartbeat()
+    assert bench.switch.state is not State.DISENGAGED
+
+
+def test_a_request_that_was_refused_counts_for_a_second_and_a_half():
+    bench = Bench()
+    bench.heartbeat(mode=HOLD_MODE, armed=False)
+    bench.telemetry(0.5)
+    bench.flight.on_engage_request(EngageRequest(arm=False, offboard=True), bench.now)
+    assert isinstance(bench.flight.on_setpoint(setpoint(5, 0), 245, 190, bench.now), Forward), "not armed"
+    bench.flight.on_engage_request(EngageRequest(arm=True, offboard=False), bench.now)
+    assert isinstance(bench.flight.on_setpoint(setpoint(5, 0), 245, 190, bench.now), Rewrite)
+    bench.telemetry(1.6)
+    bench.heartbeat(mode=HOLD_MODE, armed=False)
+    assert bench.switch.state is State.DISENGAGED
+    assert isinstance(bench.flight.on_setpoint(setpoint(5, 0), 245, 190, bench.now), Forward)

@@ -71,7 +71,7 @@ class ScriptedHandler:
 
     def __init__(self, verdict=None):
         self.verdict = Forward() if verdict is None else verdict
-        self.setpoints, self.telemetry, self.unprotected = [], [], []
+        self.setpoints, self.telemetry, self.unprotected, self.requests = [], [], [], []
 
     def on_setpoint(self, setpoint, system_id, component_id, now_ns):
         self.setpoints.append((setpoint, system_id, component_id, now_ns))
@@ -81,6 +81,9 @@ class ScriptedHandler:
 
     def on_unprotected(self, kind, detail):
         self.unprotected.append((kind, detail))
+
+    def on_engage_request(self, request, now_ns):
+        self.requests.append(request)
 
     def on_telemetry(self, message, now_ns):
         self.telemetry.append(message)
@@ -314,6 +317,9 @@ class SubstituteAll:
         return Rewrite(setpoint.x + 100.0, setpoint.y - 100.0, None, action)
 
     def on_unprotected(self, kind, detail):
+        pass
+
+    def on_engage_request(self, request, now_ns):
         pass
 
     def on_telemetry(self, message, now_ns):

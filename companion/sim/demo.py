@@ -26,6 +26,7 @@ from rich.live import Live
 from rich.table import Table
 
 from companion.clock import RealClock
+from companion.errors import CompanionError
 from companion.sim.autopilot import FakeAutopilot
 from companion.sim.camera_feed import CameraFeed
 from companion.sim.companion_process import CompanionProcess, CompanionProcessError, Event
@@ -76,8 +77,16 @@ def run_demo(output: Path, *, as_json: bool = False) -> int:
         Folder for the annotated videos; made where it does not exist.
     as_json
         Print the summary as one JSON object and nothing else on standard output.
+
+    Raises
+    ------
+    companion.errors.CompanionError
+        When the folder cannot be made, or the service does not do what the demo asks of it.
     """
-    output.mkdir(parents=True, exist_ok=True)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CompanionError(f"{output}: cannot be made a folder for the videos: {error.strerror}") from error
     console = Console(stderr=as_json)
     parts = asyncio.run(_run(output, console))
     summary = summarise(parts)

@@ -418,6 +418,11 @@ def test_a_port_in_use_is_a_clear_error(tmp_path):
         assert_clear_error(run_companion("run", "-c", str(path)), str(port))
 
 
+def test_a_demo_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
+    (tmp_path / "taken").touch()
+    assert_clear_error(run_companion("demo", "-o", str(tmp_path / "taken")), "taken")
+
+
 def test_the_default_configuration_is_one_that_check_config_accepts(tmp_path):
     printed = run_companion("config", "--default")
     assert printed.returncode == 0

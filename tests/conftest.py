@@ -1,9 +1,19 @@
-"""One thread for each numeric library: many small jobs on two cores wait for each other otherwise."""
+"""What all tests share: one thread for each numeric library, and property tests that repeat.
+
+Many small numeric jobs on two cores wait for each other otherwise. Property tests draw the same examples in each
+run, so that a change is judged by the change; ``HYPOTHESIS_PROFILE=explore`` draws new ones.
+"""
 
 import os
 
+from hypothesis import settings
+
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+settings.register_profile("gate", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "gate"))
 
 
 def pytest_configure() -> None:

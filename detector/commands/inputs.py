@@ -1,0 +1,180 @@
+"""What the commands take from their command line, and what they say when it cannot be used."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from detector.camera_model import CameraModel
+    from detector.params import DetectorParams
+
+_MAX_BASELINE_M: Final = 1000.0
+
+
+class InputError(Exception):
+    """The command line, or a file that it names, cannot be used; the message is one line for the user."""
+
+
+def add_params_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--preset`` and ``--params``; :func:`params_of` reads them."""
+    parser.add_argument(
+        "--preset", default="default", metavar="NAME", help="default or paper (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--params", type=Path, metavar="FILE", help="TOML file with parameters that replace the preset's"
+    )
+
+
+def add_camera_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--hfov`` and ``--camera``; :func:`camera_of` reads them."""
+    cameras = parser.add_mutually_exclusive_group()
+    cameras.add_argument(
+        "--hfov", type=float, metavar="DEG", help="horizontal field of view of a camera without distortion"
+    )
+    cameras.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="TOML camera file: width_px, height_px, and hfov_deg or fx_px, fy_px, cx_px, cy_px, distortion",
+    )
+
+
+def params_of(options: argparse.Namespace) -> DetectorParams:
+    """Return the parameters that ``--preset`` and ``--params`` ask for.
+
+    Raises
+    ------
+    InputError
+        They cannot be used.
+    """
+    from detector.params import DetectorParams, ParamsError
+
+    try:
+        if options.params is None:
+            return DetectorParams.preset(options.preset)
+        return DetectorParams.from_toml(options.params, options.preset)
+    except ParamsError as error:
+        raise InputError(one_line(error)) from error
+
+
+def camera_of(options: argparse.Namespace, width_px: int, height_px: int) -> CameraModel | None:
+    """Return the camera that ``--hfov`` or ``--camera`` describes, scaled to the frames where they have its shape.
+
+    None where none is described, and for a frame too small for any camera, whose answer is wrong_size in any case.
+
+    Raises
+    ------
+    InputError
+        The camera cannot be used.
+    """
+    from detector.camera_model import CameraError, CameraModel
+
+    try:
+        if options.hfov is not None:
+            least_px = 16  # of a camera's side
+            camera = CameraModel.from_hfov(max(width_px, least_px), max(height_px, least_px), options.hfov)
+            return camera if min(width_px, height_px) >= least_px else None
+        if options.camera is None:
+            return None
+        camera = CameraModel.from_file(options.camera)
+        same_shape = abs(width_px * camera.height_px - height_px * camera.width_px) <= max(camera.width_px, 1)
+        if same_shape and (width_px, height_px) != (camera.width_px, camera.height_px):
+            return camera.scaled_to(width_px, height_px)
+    except CameraError as error:
+        prefix = "--hfov: " if options.hfov is not None else ""
+        raise InputError(one_line(f"{prefix}{error}")) from error
+    return camera
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Return an image file as grey (H, W) uint8.
+
+    Raises
+    ------
+    InputError
+        It cannot be read or decoded.
+    """
+    import cv2
+    import numpy as np
+
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise InputError(f"{path}: cannot be read: {cause(error)}") from error
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    except cv2.error as error:  # a header that promises absurd sizes
+        raise InputError(f"{path}: is not an image that can be decoded") from error
+    if image is None:
+        raise InputError(f"{path}: is not an image that can be decoded")
+    return np.asarray(image, np.uint8)
+
+
+def metres(text: str) -> float:
+    """Read metres from a command line, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= _MAX_BASELINE_M:
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, allowed are metres above 0 and up to {_MAX_BASELINE_M:g}"
+        )
+    return value
+
+
+def write_picture(option: str, path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write an image in the format that the file's name asks for.
+
+    Raises
+    ------
+    InputError
+        The format is unknown or the file cannot be written; the message names ``option``.
+    """
+    import cv2
+
+    try:
+        done, data = cv2.imencode(path.suffix, picture)
+    except cv2.error as error:
+        raise InputError(
+            f"{option} {path}: found the ending {path.suffix!r}, allowed is an image format such as .png"
+        ) from error
+    if not done:
+        raise InputError(f"{option} {path}: the picture cannot be encoded as {path.suffix}")
+    try:
+        path.write_bytes(data.tobytes())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{option} {path}: cannot be written: {cause(error)}") from error
+
+
+def json_clean(value: Any) -> Any:
+    """Return the value with lists for tuples and null for figures that are not finite, which JSON has no word for."""
+    if isinstance(value, dict):
+        return {key: json_clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_clean(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def cause(error: Exception) -> str:
+    """Return why a file could not be used, in one line."""
+    return (error.strerror if isinstance(error, OSError) else None) or one_line(error)
+
+
+def one_line(message: object) -> str:
+    """Return a message without its line breaks."""
+    return "; ".join(part.strip() for part in str(message).splitlines() if part.strip())
+
+
+def short(value: object, limit: int = 60) -> str:
+    """Return a value as text of limited length."""
+    text = repr(value)
+    return text if len(text) <= limit else f"{text[:limit]}..."

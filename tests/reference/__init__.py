@@ -1,1 +1,1 @@
-"""A slow, literal transcription of the paper: the oracle of the detector's tests."""
+"""A literal transcription of the paper: the oracle of the detector's tests."""

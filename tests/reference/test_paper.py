@@ -16,7 +16,7 @@ from detector.params import DetectorParams, PresetName
 from detector.pipeline import VoidDetector
 from detector.results import Direction, NoDetection, SinglePlane
 from tests.reference.pairs import approach, window
-from tests.reference.paper import Answer, Settings, void_of_pair
+from tests.reference.paper import Answer, Kept, settings_of, void_of_pair
 
 DATA = Path(__file__).parents[1] / "data" / "pairs"
 CAMERA = CameraModel.from_hfov(480, 320, 80.0)
@@ -55,33 +55,6 @@ def pair_of(name: str) -> tuple[np.ndarray, np.ndarray]:
     scene = make(**arguments)
     first, second = (scene.render(CAMERA, (north_m, 0.0, down_m), LOOKING_NORTH) for north_m in (0.0, STEP_M))
     return first, second
-
-
-def settings_of(params: DetectorParams) -> Settings:
-    """Say to the oracle what a preset says, as far as the paper can be read that way."""
-    by_ratio = params.plane_test == "deviation_ratio"
-    return Settings(
-        min_features=params.min_features,
-        min_vectors=params.min_flow_vectors,
-        each_location_once=params.unique_locations,
-        round_trip_px=params.round_trip_px,
-        shortest_tenths=params.shortest_fraction,
-        circular_angles=params.angle_statistics == "circular",
-        angle_gain=params.angle_gain,
-        n_first=params.clusters_min,
-        n_last=params.clusters_max,
-        k_change=params.nearest_change,
-        plane_by_ratio=by_ratio,
-        plane_threshold=params.plane_ratio if by_ratio else params.plane_deviation_px_at_1280,
-        still_px_1280=params.still_flow_px_at_1280,
-        still_floor_px=params.still_flow_floor_px,
-        votes_1280=params.hough_votes_at_1280,
-        shortest_line_px_1280=params.hough_min_length_px_at_1280,
-        longest_gap_px_1280=params.hough_max_gap_px_at_1280,
-        vertical_gap_deg=params.vertical_gap_deg,
-        cell_px=params.cell_px,
-        vote_tolerance=params.vote_tolerance,
-    )
 
 
 def params_of(preset: PresetName) -> DetectorParams:
@@ -129,6 +102,32 @@ def test_the_detector_and_the_oracle_agree_step_by_step(name: str, preset: Prese
     assert seen.lmcc_px == (None if oracle.lmcc_px is None else pytest.approx(oracle.lmcc_px, abs=1e-3))
     assert seen.n_lines == oracle.n_lines
     assert sorted(seen.candidates_px) == sorted(oracle.candidates_px)
+    if isinstance(found, Direction):
+        assert math.dist((found.x_px, found.y_px), (oracle.x_px, oracle.y_px)) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("first", "other"), [("corridor", "narrow corridor"), ("narrow corridor", "window"), ("window", "room")]
+)
+def test_the_other_loops_agree_too_with_p_n_and_k_of_the_first(first: str, other: str) -> None:
+    params = params_of("default")
+    starts = seeded_starts(params.seed, params.kmeans_restarts)
+    detector = VoidDetector(params, starts=starts)
+    before = detector.detect(*pair_of(first)).detection.diagnostics
+    kept = Kept(before.p, before.n, before.k)
+    oracle = void_of_pair(*pair_of(other), starts, settings_of(params), kept)
+    found = detector.detect(*pair_of(other)).detection
+    seen = found.diagnostics
+
+    assert kept != (
+        oracle_of(other, "default").p,
+        oracle_of(other, "default").n,
+        oracle_of(other, "default").k,
+    )
+    assert (seen.p, seen.n, seen.k) == (oracle.p, oracle.n, oracle.k) == kept
+    assert kind_of(found) == oracle.kind
+    assert seen.n_after_angle == oracle.n_after_angle
+    assert sorted(seen.centre_magnitudes_px) == pytest.approx(sorted(oracle.centre_magnitudes_px), abs=1e-6)
     if isinstance(found, Direction):
         assert math.dist((found.x_px, found.y_px), (oracle.x_px, oracle.y_px)) < 1e-3
 

@@ -16,8 +16,9 @@ Setpoints have no loop: they are decided and sent in the call that received them
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from contextlib import AsyncExitStack
+from functools import partial
 from typing import Any, Final
 
 from companion.clock import Clock
@@ -25,6 +26,7 @@ from companion.config import Config
 from companion.errors import SourceError
 from companion.frames.file import FileSource
 from companion.frames.open import open_source
+from companion.frames.source import FrameSource
 from companion.guidance.observation import DetectionReport
 from companion.interception import Interception
 from companion.log import Log
@@ -53,18 +55,34 @@ class Service:
         Where time comes from.
     log
         Takes the events.
+    open_frames
+        Makes the frame source; by default the one that the configuration names. A simulator gives its own.
     """
 
-    def __init__(self, config: Config, *, clock: Clock, log: Log) -> None:
+    def __init__(
+        self,
+        config: Config,
+        *,
+        clock: Clock,
+        log: Log,
+        open_frames: Callable[[], FrameSource] | None = None,
+    ) -> None:
         self._config = config
         self._clock = clock
         self._log = log
+        self._open_frames = open_frames or partial(open_source, config.source, clock=clock, log=log)
+        self._links: tuple[UdpEndpoint, ...] = ()
         self._stop = asyncio.Event()
         self._health_ns = clock.now_ns()
         self._last_frame_ns: int | None = None
         self._source_fault: str | None = "no frame yet"
         self._too_slow = False
         self._report_failure = ""
+
+    @property
+    def links(self) -> tuple[UdpEndpoint, ...]:
+        """Both sides while it runs, the planner's first; empty before."""
+        return self._links
 
     def stop(self) -> None:
         """End the service; :meth:`run` returns soon after."""
@@ -84,6 +102,7 @@ class Service:
             autopilot = UdpEndpoint(config.link.autopilot, name="link.autopilot", now_ns=clock.now_ns)
             await stack.enter_async_context(planner)
             await stack.enter_async_context(autopilot)
+            self._links = (planner, autopilot)
             identity = Identity(
                 planner, autopilot, component_id=config.link.component_id, now_ns=clock.now_ns
             )
@@ -137,7 +156,7 @@ class Service:
         failures = 0
         while True:
             try:
-                source = open_source(config, clock=clock, log=log)
+                source = self._open_frames()
                 async with source:
                     log.info("source_opened", kind=config.kind)
                     if config.kind == "file":

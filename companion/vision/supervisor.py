@@ -307,9 +307,8 @@ class VisionSupervisor:
             return
         try:
             if life.mapped is not slots:
-                life.send(MapSlots(slots.slot_bytes, N_SLOTS), slots.fd)
-                life.mapped = slots
-            life.send(frame)
+                life.map_slots(slots)
+            life.ask(frame)
         except OSError:
             return  # it has just died, which its socket is about to say; the frame waits for the next one
         self._waiting = None
@@ -371,11 +370,11 @@ class _WorkerThread:
         OSError
             When it cannot be started.
         """
-        return await asyncio.wrap_future(self._executor.submit(self._start, threads))
+        return await asyncio.get_running_loop().run_in_executor(self._executor, self._start, threads)
 
     async def stop(self, grace_s: float) -> int | None:
         """End the process that was started last, if any, also where ``start`` was cancelled."""
-        return await asyncio.wrap_future(self._executor.submit(self._stop, grace_s))
+        return await asyncio.get_running_loop().run_in_executor(self._executor, self._stop, grace_s)
 
     def _start(self, threads: int) -> WorkerProcess:
         self._process = WorkerProcess.start(threads)
@@ -431,7 +430,7 @@ class _Life:
         loop = asyncio.get_running_loop()
         loop.add_reader(process.message_fd, self._on_message)
         loop.add_reader(process.output_fd, self._on_output)
-        process.send(message)
+        self.ask(message)
 
     async def stop(self, grace_s: float = 0.0) -> int | None:
         """Stop listening, end the process and wait until it is gone; return its exit status."""
@@ -443,11 +442,21 @@ class _Life:
             loop.remove_reader(process.output_fd)
         return await self._thread.stop(grace_s)
 
-    def send(self, message: MapSlots | Detect, fd: int | None = None) -> None:
-        """Send a message; raises OSError when the worker is gone."""
+    def ask(self, message: Start | Detect) -> None:
+        """Send a message that is answered; raises OSError when the worker is gone."""
+        process = self._running()
+        process.send(message)
+        self._clock.answer_owed(process.message_fd, "start" if isinstance(message, Start) else "frame")
+
+    def map_slots(self, slots: FrameSlots) -> None:
+        """Tell where frames lie from now on; raises OSError when the worker is gone."""
+        self._running().send(MapSlots(slots.slot_bytes, N_SLOTS), slots.fd)
+        self.mapped = slots
+
+    def _running(self) -> WorkerProcess:
         if self._process is None:
             raise BrokenPipeError("the worker is gone")
-        self._process.send(message, fd)
+        return self._process
 
     def arm(self, limit_s: float, reason: str) -> None:
         """Allow this much time for what is asked now; ``_Overrun`` arrives when it has passed."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from detector.flow import Tracks
-from detector.overlay import draw, headline
+from detector.overlay import CandidateRole, candidate_roles, draw, headline, legible_zoom
 from detector.pipeline import PairResult
 from detector.results import (
     Diagnostics,
@@ -60,10 +60,13 @@ def test_lmcc_centres_candidates_and_lines_are_drawn_in_their_colours():
     assert tuple(picture[200, 60]) == (60, 220, 60)  # a centre, green
     assert tuple(picture[120, 120]) == (0, 235, 255)  # LMCC, yellow
     assert tuple(picture[160, 104]) == (255, 255, 255)  # the elected candidate, white
-    assert tuple(picture[220, 294]) == (255, 130, 30)  # another one, blue
+    assert tuple(picture[220, 300 - 8]) == (255, 130, 30)  # another one, blue, a diamond
     assert tuple(picture[120, 20]) == (40, 160, 255)  # a line, orange
     rejected = Direction(200, 150, DirectionKind.LOWEST_FLOW, None, found.diagnostics)
-    assert tuple(draw(GREY, result(rejected))[160, 104]) == (60, 60, 255)  # examined, not elected: red
+    crossed_out = draw(GREY, result(rejected))
+    assert tuple(crossed_out[160, 104]) == (60, 60, 255)  # examined, not elected: red
+    assert tuple(crossed_out[160, 110]) == (60, 60, 255)  # and crossed out, for who does not see red
+    assert tuple(picture[160, 110]) != (60, 60, 255)
 
 
 def test_long_flow_has_another_colour_than_short_flow():
@@ -71,8 +74,38 @@ def test_long_flow_has_another_colour_than_short_flow():
     tracks = Tracks(start, start + np.array([[30.0, 0.0], [4.0, 0.0]]))
     picture = draw(GREY, result(SinglePlane(None, Diagnostics()), tracks))
     long, short = picture[100, 60].astype(int), picture[140, 52].astype(int)
-    assert long[2] > long[0]  # towards red
+    assert long[2] > long[0]  # towards yellow
     assert short[0] > short[2]  # towards blue
+    assert long.sum() > short.sum()  # and brighter, which needs no colour to be seen
+
+
+def test_notes_stand_below_the_answer_and_a_single_plane_has_a_border():
+    wall = result(SinglePlane(None, Diagnostics()))
+    plain, noted = draw(GREY, wall), draw(GREY, wall, notes=("frame 12",))
+    assert not (plain[24:44, 8:-8] > 200).any()
+    assert (noted[24:44, 8:-8] > 200).any()
+    assert tuple(plain[120, 0]) == (40, 160, 255)
+    assert tuple(draw(GREY, result(direction()))[120, 0]) == (72, 72, 72)
+
+
+@pytest.mark.parametrize(("width_px", "zoom"), [(1, 8), (64, 8), (160, 3), (256, 2), (540, 1), (1280, 1)])
+def test_small_frames_are_enlarged_until_words_can_be_read(width_px, zoom):
+    assert legible_zoom(width_px) == zoom
+
+
+def test_each_candidate_has_its_role_and_the_one_examined_comes_last():
+    found = direction(
+        kind=DirectionKind.VANISHING_POINT,
+        lmcc_px=(100.0, 100.0),
+        candidates_px=((110.0, 100.0), (300.0, 20.0)),
+    )
+    assert candidate_roles(found) == [
+        ((300.0, 20.0), CandidateRole.VALID),
+        ((110.0, 100.0), CandidateRole.ELECTED),
+    ]
+    rejected = Direction(100, 100, DirectionKind.LOWEST_FLOW, None, found.diagnostics)
+    assert [role for _, role in candidate_roles(rejected)] == [CandidateRole.VALID, CandidateRole.REJECTED]
+    assert candidate_roles(direction()) == []
 
 
 def test_a_point_far_outside_and_a_tiny_frame_are_no_error():

@@ -102,6 +102,8 @@ class FakeAutopilot:
         self._transport: asyncio.DatagramTransport | None = None
         self._task: asyncio.Task[None] | None = None
         self._delayed: set[asyncio.TimerHandle] = set()
+        self.datagrams_sent = 0
+        self.datagrams_received = 0
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
@@ -266,6 +268,7 @@ class FakeAutopilot:
 
     def datagram_arrived(self, datagram: bytes, sender: Address) -> None:
         """Take one datagram from the socket."""
+        self.datagrams_received += 1
         for delay_s, content in self._incoming.pass_on(datagram):
             if delay_s > 0.0:
                 self._later(delay_s, content, sender)
@@ -300,6 +303,7 @@ class FakeAutopilot:
     def _transmit(self, datagram: bytes, peer: Address) -> None:
         if self._transport is not None and not self._transport.is_closing():
             self._transport.sendto(datagram, peer)
+            self.datagrams_sent += 1
 
 
 class _Receiver(asyncio.DatagramProtocol):

@@ -162,6 +162,8 @@ class Planner:
         self.armed = False
         self.position_ned_m: Vector3 | None = None
         self.frames_received = 0
+        self.datagrams_sent = 0
+        self.datagrams_received = 0
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
@@ -354,6 +356,7 @@ class Planner:
 
     def datagram_arrived(self, datagram: bytes, sender: Address) -> None:
         """Take one datagram from the socket."""
+        self.datagrams_received += 1
         for frame in self._reader.read(datagram):
             self.frames_received += 1
             if self._keep_frames:
@@ -433,6 +436,7 @@ class Planner:
     def _send(self, datagram: bytes) -> None:
         if self._transport is not None and self._remote is not None and not self._transport.is_closing():
             self._transport.sendto(datagram, self._remote)
+            self.datagrams_sent += 1
             if self._keep_frames:
                 self.sent_frames.append(datagram)
 

@@ -14,6 +14,7 @@ from companion.errors import LinkError
 from companion.guidance.observation import Pose
 from companion.sim.autopilot_endpoint import Address, AutopilotEndpoint, SetpointRecord
 from companion.sim.commander import Result
+from companion.sim.estimate_errors import ErringEstimate
 from companion.sim.flight_controller import FlightController
 from companion.sim.link_faults import FaultyLink, LinkFaults
 from companion.sim.parameters import ParameterTable
@@ -56,6 +57,8 @@ class FakeAutopilot:
         Faults of the link, one for each direction; can be changed at any time by ``set_faults``.
     keep_frames
         Keep the bytes of every frame received and sent.
+    erring
+        Errors of the estimate that it flies by and reports; without it the estimate is the truth.
 
     Raises
     ------
@@ -79,6 +82,7 @@ class FakeAutopilot:
         outgoing: LinkFaults | None = None,
         incoming: LinkFaults | None = None,
         keep_frames: bool = False,
+        erring: ErringEstimate | None = None,
     ) -> None:
         self._clock: Clock = clock if clock is not None else RealClock()
         self._controller = FlightController(
@@ -90,6 +94,7 @@ class FakeAutopilot:
             armed=armed,
             system_id=system_id,
             component_id=component_id,
+            erring=erring,
         )
         self._endpoint = AutopilotEndpoint(
             self._controller, system_id=system_id, component_id=component_id, keep_frames=keep_frames
@@ -167,7 +172,7 @@ class FakeAutopilot:
 
     @property
     def true_state(self) -> VehicleState:
-        """Where the vehicle really is: differs from ``state`` after a jump of the estimate."""
+        """Where the vehicle really is: differs from ``state`` by the errors and jumps of the estimate."""
         return self._controller.true_state
 
     def true_pose(self) -> Pose:

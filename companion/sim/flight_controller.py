@@ -7,6 +7,7 @@ from collections import deque
 
 from companion.guidance.setpoint import LocalSetpoint
 from companion.sim.commander import Answer, Commander, Result
+from companion.sim.estimate_errors import ErringEstimate
 from companion.sim.navigator import Navigator, Situation
 from companion.sim.offboard_input import Refusal, interpret
 from companion.sim.parameters import ParameterTable
@@ -38,6 +39,8 @@ class FlightController:
         The state to begin with. Armed above the ground means flying.
     system_id, component_id
         Whom setpoints must be for.
+    erring
+        Errors of the estimate; without it the estimate is the truth.
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class FlightController:
         armed: bool = False,
         system_id: int = 1,
         component_id: int = 1,
+        erring: ErringEstimate | None = None,
     ) -> None:
         self.parameters = parameters if parameters is not None else ParameterTable()
         self.pilot_present = False
@@ -59,6 +63,7 @@ class FlightController:
         self._replay = replay
         self._replay_start_ns: int | None = None
         self._replayed: tuple[float, VehicleState] | None = None
+        self._erring = erring
         self._commander = Commander(self.parameters, mode=mode, armed=armed)
         self._navigator = Navigator(self.parameters)
         self._offboard: Target | None = None
@@ -98,8 +103,10 @@ class FlightController:
 
     @property
     def estimate(self) -> VehicleState:
-        """Where the autopilot believes it is: the truth, moved by the jumps of the estimate so far."""
+        """Where the autopilot believes it is: the truth, moved by the errors and jumps of the estimate so far."""
         state = self.true_state
+        if self._erring is not None:
+            state = self._erring.estimate_of(state)
         return dataclasses.replace(state, position_ned_m=_sum(state.position_ned_m, self._jump))
 
     @property
@@ -195,6 +202,8 @@ class FlightController:
         self.texts.clear()
 
     def _step(self, dt_s: float) -> None:
+        if self._erring is not None:
+            self._erring.step(dt_s)
         estimate = self.estimate
         situation = Situation(
             mode=self.mode,
@@ -232,7 +241,8 @@ class FlightController:
         north, east, down = (
             None if p is None else p - j for p, j in zip(self._target.position_ned_m, self._jump, strict=True)
         )
-        return dataclasses.replace(self._target, position_ned_m=(north, east, down))
+        target = dataclasses.replace(self._target, position_ned_m=(north, east, down))
+        return target if self._erring is None else self._erring.truth_of(target)
 
     def _told(self, answer: Answer) -> Result:
         if answer.text:

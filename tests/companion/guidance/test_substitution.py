@@ -225,12 +225,12 @@ def test_a_single_wall_answer_among_others_does_not_turn():
 def test_an_older_frame_than_the_last_is_ignored():
     flight = Flight(HALL)
     flight.fly(setpoint(10, 0), 5)
-    before = flight.switch._answer
+    before = flight.switch._evidence.answer
     flight.switch.on_report(
         DetectionReport(1, flight.now - 3 * SEC, "lowest_flow", pose=flight.pose(), ray_body=(0, 1, 0)),
         flight.now,
     )
-    assert flight.switch._answer is before
+    assert flight.switch._evidence.answer is before
 
 
 @pytest.mark.parametrize("start", [0.0, 1.5, 3.1, -2.0])
@@ -291,14 +291,14 @@ def test_whatever_happens_steps_yaw_and_hold_stay_within_their_caps(events):
                     flight.step(None)
         for _ in range(count):
             state_before = flight.state
-            known = flight.switch._pose if not flight.poses_alive else flight.pose()
+            known = flight.switch._evidence.pose if not flight.poses_alive else flight.pose()
             verdict = flight.step(goal)
             if not flight.offboard:
                 assert flight.state is State.DISENGAGED
                 assert isinstance(verdict, Forward)
                 last_yaw = anchor = None
                 continue
-            known = flight.switch._pose
+            known = flight.switch._evidence.pose
             target = sent_xy(verdict, goal)
             if target is None:
                 assert known is None

@@ -180,7 +180,7 @@ def test_only_answers_from_after_its_beginning_end_a_probe():
     stale = DetectionReport(
         999, bench.now, "lowest_flow", ray_body=(1, 0, 0), pose=bench.pose(), earlier_frame_ns=before
     )
-    bench.switch._newest_frame_ns = 0
+    bench.switch._evidence.newest_frame_ns = 0
     bench.switch.on_report(dataclasses.replace(stale, frame_ns=began - MS), bench.now)
     bench.ask(AHEAD)
     assert bench.state is State.PROBE
@@ -203,7 +203,7 @@ def test_walls_seen_before_a_turn_do_not_count_after_it():
             break
         bench.yaw = wrap_rad(bench.yaw + math.radians(0.5))
     assert bench.state is State.PROBE
-    assert not any(bench.switch._votes)
+    assert not any(bench.switch._evidence.votes)
 
 
 # ---------------------------------------------------------------- steps and their caps
@@ -527,7 +527,7 @@ def test_a_probe_takes_the_way_seen_free_else_back_along_the_track_else_once_ahe
             bench.e = 0.0
         if name == "seen":
             bench.void(0.0, {0.6: 5.0, 0.0: 0.9})
-            bench.switch._answer = None
+            bench.switch._evidence.answer = None
         sent = None
         for _ in range(60):
             bench.report("none", reason="no_motion")
@@ -543,7 +543,7 @@ def test_a_probe_takes_the_way_seen_free_else_back_along_the_track_else_once_ahe
 def test_a_bearing_whose_neighbour_is_blocked_is_not_probed():
     bench = started(config=GuidanceConfig(bootstrap_probe=False))
     bench.void(0.0, {0.30: 5.0, 0.34: 0.4})
-    bench.switch._answer = None
+    bench.switch._evidence.answer = None
     for _ in range(60):
         bench.report("none", reason="no_motion")
         bench.ask(AHEAD)
@@ -759,8 +759,8 @@ def test_a_blind_step_is_made_once_at_a_heading():
         verdict = bench.ask(AHEAD)
         if verdict.yaw is not None:
             bench.yaw = verdict.yaw
-        if bench.state is State.PROBE and (not headings or headings[-1] != bench.switch._probe_yaw_rad):
-            headings.append(bench.switch._probe_yaw_rad)
+        if bench.state is State.PROBE and (not headings or headings[-1] != bench.switch._plan.probe_yaw_rad):
+            headings.append(bench.switch._plan.probe_yaw_rad)
     assert len(headings) >= 6
     least = math.radians(CONFIG.turn_step_deg) / 2
     for i, one in enumerate(headings):

@@ -1,0 +1,198 @@
+"""What is sent in each state, within its caps: the longest step, the free distance, the yaw's rate."""
+
+from __future__ import annotations
+
+import math
+
+from companion.config import GuidanceConfig
+from companion.guidance.coordinates import heading_rad, wrap_rad
+from companion.guidance.observation import Pose
+from companion.guidance.plan import Plan
+from companion.guidance.setpoint import Forward, LocalSetpoint, Rewrite, TypeMask, Verdict
+from companion.guidance.situation import Evidence, Situation, remaining_m
+from companion.guidance.table import LOOK_AGAIN, State, Table
+
+_COMMAND_RECENT_NS = 500_000_000
+_MAX_SLEW_DT_S = 0.2
+_MAX_YAW_LEAD_RAD = math.radians(30.0)
+"""A commanded yaw is never further ahead of the heading: a vehicle that could not turn must not snap round."""
+
+
+class YawSlew:
+    """Caps the rate of the commanded yaw: autopilots do not all cap it themselves.
+
+    Parameters
+    ----------
+    config
+        ``yaw_rate_deg_s``, and the silence after which a planner begins anew.
+    """
+
+    def __init__(self, config: GuidanceConfig) -> None:
+        self._rate_rad_s = math.radians(config.yaw_rate_deg_s)
+        self._paused_after_s = config.planner_timeout_s
+        self._yaw_rad = 0.0
+        self._at_ns = -(1 << 62)
+
+    def forget(self) -> None:
+        """Begin at the heading with the next command."""
+        self._at_ns = -(1 << 62)
+
+    def commanded(self, yaw_rad: float, now_ns: int) -> None:
+        """Take note of the yaw that leaves."""
+        self._yaw_rad = wrap_rad(yaw_rad)
+        self._at_ns = now_ns
+
+    def toward(self, yaw_rad: float, pose: Pose, now_ns: int) -> float:
+        """Return the next yaw on the way to ``yaw_rad``."""
+        heading = heading_rad(pose.q_ned_from_body)
+        since_ns = now_ns - self._at_ns
+        start = heading
+        if since_ns <= _COMMAND_RECENT_NS:
+            lead = wrap_rad(self._yaw_rad - heading)
+            start += max(-_MAX_YAW_LEAD_RAD, min(_MAX_YAW_LEAD_RAD, lead))
+        # A planner of 1-2 Hz is slow, not new: it turns too. After a longer pause the first step is none.
+        paused = since_ns > self._paused_after_s * 1e9
+        dt_s = 0.0 if paused else min(since_ns / 1e9, _MAX_SLEW_DT_S)
+        cap = self._rate_rad_s * dt_s
+        return wrap_rad(start + max(-cap, min(cap, wrap_rad(yaw_rad - start))))
+
+
+class Command:
+    """Turns the state into a verdict for one setpoint.
+
+    Parameters
+    ----------
+    config
+        Limits and distances.
+    evidence, plan, table
+        What is known, what is being done, and what the situation asks for.
+    camera_yaw_rad
+        Azimuth of the camera's axis relative to the body's forward axis (its mounting).
+    """
+
+    def __init__(
+        self,
+        config: GuidanceConfig,
+        evidence: Evidence,
+        plan: Plan,
+        table: Table,
+        *,
+        camera_yaw_rad: float,
+    ) -> None:
+        self._config = config
+        self._evidence = evidence
+        self._plan = plan
+        self._table = table
+        self._camera_yaw_rad = camera_yaw_rad
+        self.yaw = YawSlew(config)
+
+    def act(self, state: State, s: Situation) -> Verdict:
+        """Return what is sent in a state (any but DISENGAGED)."""
+        plan = self._plan
+        if state is State.FOLLOW:
+            return self._follow(s)
+        if state is State.STEER and s.answer is not None:
+            return self._steer(s, s.answer.azimuth_rad, self._evidence.void_free_m(s.answer, s))
+        if state is State.PROBE:
+            return self._rewrite(*plan.probe_target, plan.probe_yaw_rad, "substituted", s)
+        if plan.anchor is None:
+            plan.set_anchor(s.pose)
+        x, y = plan.anchor or (s.pose.north_m, s.pose.east_m)
+        if state is State.ALIGN:
+            return self._rewrite(x, y, s.bearing_rad - self._camera_yaw_rad, "turned", s)
+        if state is State.TURN:
+            plan.anchor_yaw_rad = wrap_rad(plan.turn_target_rad - self._camera_yaw_rad)
+            return self._rewrite(x, y, plan.anchor_yaw_rad, "turned", s)
+        return self._rewrite(x, y, plan.anchor_yaw_rad, "held", s)
+
+    def hold_blindly(self, now_ns: int) -> Verdict | None:
+        """Return a hold at the anchor, whatever the pose is now; None without an anchor."""
+        if self._plan.anchor is None:
+            return None
+        self.yaw.commanded(self._plan.anchor_yaw_rad, now_ns)
+        return Rewrite(*self._plan.anchor, self._plan.anchor_yaw_rad, "held")
+
+    def _steer(self, s: Situation, psi: float, free_m: float | None) -> Verdict:
+        step_m = self._step_m(s.goal_m, free_m)
+        out_of_sight = abs(wrap_rad(psi - s.look_rad)) > math.radians(self._config.align_deg)
+        if out_of_sight or self._table.choose(s)[1] == LOOK_AGAIN:
+            # The camera must look where it flies, and no way is open before it is seen again.
+            step_m = 0.0
+        x, y = s.pose.north_m + step_m * math.cos(psi), s.pose.east_m + step_m * math.sin(psi)
+        return self._rewrite(x, y, psi - self._camera_yaw_rad, "substituted", s)
+
+    def _follow(self, s: Situation) -> Verdict:
+        sp = s.setpoint
+        yaw_used = not sp.type_mask & TypeMask.YAW_IGNORE
+        wanted_yaw: float | None
+        if s.reached:
+            step_m, wanted_yaw = min(s.goal_m, self._config.max_step_m), (sp.yaw if yaw_used else None)
+        else:
+            step_m = self._step_m(s.goal_m, self._free_to_goal_m(s))
+            if self._table.choose(s)[1] == LOOK_AGAIN:
+                step_m = 0.0
+            wanted_yaw = s.bearing_rad - self._camera_yaw_rad
+            if yaw_used and abs(wrap_rad(sp.yaw + self._camera_yaw_rad - s.bearing_rad)) <= math.radians(
+                self._config.view_deg
+            ):
+                wanted_yaw = sp.yaw
+        whole_step = step_m >= s.goal_m
+        slewed = None if wanted_yaw is None else self.yaw.toward(wanted_yaw, s.pose, s.now_ns)
+        if whole_step and self._may_pass(s, slewed):
+            self.yaw.commanded(sp.yaw if yaw_used else heading_rad(s.pose.q_ned_from_body), s.now_ns)
+            return Forward()
+        if whole_step:
+            x, y = sp.x, sp.y
+        else:
+            x = s.pose.north_m + step_m * math.cos(s.bearing_rad)
+            y = s.pose.east_m + step_m * math.sin(s.bearing_rad)
+        return self._rewrite(x, y, wanted_yaw, "substituted", s, slewed=slewed)
+
+    def _free_to_goal_m(self, s: Situation) -> float | None:
+        """Return the free distance toward the goal, where anything is known of it."""
+        free_m = s.free_bearing_m
+        if s.answer is not None and s.answer.is_plane:
+            plane_m = remaining_m(s.answer.report, s.pose)
+            return plane_m if free_m is None else min(free_m, plane_m)
+        if s.answer is not None and free_m is None:
+            return self._evidence.void_free_m(s.answer, s)  # the void agrees: the next best that is known
+        return free_m
+
+    def _may_pass(self, s: Situation, slewed: float | None) -> bool:
+        """Whether a setpoint whose whole step is granted may pass byte for byte, its yaw and further terms included."""
+        sp = s.setpoint
+        yaw_used = not sp.type_mask & TypeMask.YAW_IGNORE
+        if s.reached and not yaw_used:  # hover, with or without a slow yaw rate
+            return self._is_calm(sp)
+        further_terms = any(field.startswith(("v", "af", "yaw_rate")) for field in sp.used_fields())
+        yaw_is_granted = slewed is not None and abs(wrap_rad(slewed - sp.yaw)) < 1e-6
+        return yaw_used and yaw_is_granted and not further_terms
+
+    def _is_calm(self, sp: LocalSetpoint) -> bool:
+        """Whether the further terms of a setpoint at the goal cannot carry the vehicle away."""
+        used = sp.used_fields()
+        if any(field.startswith(("v", "af")) for field in used):
+            return False
+        return abs(used.get("yaw_rate", 0.0)) <= math.radians(self._config.yaw_rate_deg_s)
+
+    def _step_m(self, goal_m: float, free_m: float | None) -> float:
+        step_m = min(goal_m, self._config.max_step_m)
+        if free_m is not None:
+            step_m = min(step_m, free_m - self._config.step_margin_m)
+        return max(0.0, step_m)
+
+    def _rewrite(
+        self,
+        x: float,
+        y: float,
+        yaw_rad: float | None,
+        action: str,
+        s: Situation,
+        *,
+        slewed: float | None = None,
+    ) -> Rewrite:
+        if yaw_rad is None:
+            return Rewrite(x, y, None, action)
+        yaw = self.yaw.toward(yaw_rad, s.pose, s.now_ns) if slewed is None else slewed
+        self.yaw.commanded(yaw, s.now_ns)
+        return Rewrite(x, y, yaw, action)

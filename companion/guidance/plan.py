@@ -1,0 +1,126 @@
+"""What the present state set out to do: the place it holds, the turn, the probe, the episode they belong to."""
+
+from __future__ import annotations
+
+import math
+
+from companion.config import GuidanceConfig
+from companion.guidance.coordinates import heading_rad, wrap_rad
+from companion.guidance.memory import Episode
+from companion.guidance.observation import Pose
+from companion.guidance.situation import Evidence
+
+TURN_DONE_RAD = math.radians(5.0)
+"""A turn that is this close to its end is done."""
+_DEAD_AHEAD_RAD = math.radians(5.0)
+
+Place = tuple[float, float]
+"""North and east in local NED, m."""
+
+
+class Plan:
+    """Memory of the manoeuvre; it is made when a state is entered and read while it lasts.
+
+    Parameters
+    ----------
+    config
+        Limits and distances.
+    evidence
+        What is known of the world.
+    """
+
+    def __init__(self, config: GuidanceConfig, evidence: Evidence) -> None:
+        self._config = config
+        self._evidence = evidence
+        self.episode: Episode | None = None
+        self.anchor: Place | None = None
+        self.anchor_yaw_rad = 0.0
+        self.steer_start: Place = (0.0, 0.0)
+        self.turn_target_rad = 0.0
+        self.probed = ""
+        self.probe_target: Place = (0.0, 0.0)
+        self.probe_yaw_rad = 0.0
+
+    def forget(self) -> None:
+        """Forget episode and anchor: the mode was left, or the local frame is another one."""
+        self.episode = None
+        self.anchor = None
+
+    def end_episode_left_behind(self, pose: Pose) -> None:
+        """End the episode where the vehicle has left its place."""
+        if self.episode is not None and self.episode.over(pose, self._config.episode_distance_m):
+            self.episode = None
+
+    def set_anchor(self, pose: Pose) -> None:
+        """Hold here, at the present heading."""
+        self.anchor = (pose.north_m, pose.east_m)
+        self.anchor_yaw_rad = heading_rad(pose.q_ned_from_body)
+
+    def begin_or_keep_episode(self, pose: Pose) -> Episode:
+        """Return the episode of this place, in which the goal's bearing is blocked now."""
+        episode = self.episode
+        if episode is None or episode.over(pose, self._config.episode_distance_m):
+            episode = self.episode = Episode(pose.north_m, pose.east_m)
+        bearing = self._goal_bearing_rad(pose)
+        if bearing is not None:
+            episode.block(bearing, pose)
+        return episode
+
+    def begin_turn(self, pose: Pose) -> None:
+        """Choose the side, once for an episode, and where the next step of the turn ends."""
+        episode = self.episode
+        if episode is None:
+            return
+        look = self._evidence.look_rad(pose)
+        if episode.side == 0:
+            bearing = self._goal_bearing_rad(pose)
+            to_goal = 0.0 if bearing is None else wrap_rad(bearing - look)
+            episode.side = -1 if to_goal < -_DEAD_AHEAD_RAD else 1
+        # From where the last turn was to end, not from where it was found done: twelve steps of 30 are 360.
+        goes_on = episode.sweep_rad > 0 and abs(wrap_rad(self.turn_target_rad - look)) <= 2 * TURN_DONE_RAD
+        start = self.turn_target_rad if goes_on else look
+        self.turn_target_rad = wrap_rad(start + episode.side * math.radians(self._config.turn_step_deg))
+
+    def begin_probe(self, pose: Pose, now_ns: int) -> None:
+        """Choose where to step, and take only answers from now on: those before were at another heading."""
+        look = self._evidence.look_rad(pose)
+        choice = self.probe_choice(pose, look, now_ns)
+        self.probe_yaw_rad = heading_rad(pose.q_ned_from_body)
+        self._evidence.take_answers_after(now_ns)
+        if choice is None:
+            self.probed = ""
+            self.probe_target = (pose.north_m, pose.east_m)
+            return
+        self.probed, self.probe_target = choice
+        if self.probed == "camera axis":
+            if self.episode is None:
+                self.episode = Episode(pose.north_m, pose.east_m)
+            self.episode.bootstrap(look)
+
+    def probe_choice(self, pose: Pose, look_rad: float, now_ns: int) -> tuple[str, Place] | None:
+        """Return why and where a probe would step, or None where there is no way for it."""
+        config, evidence = self._config, self._evidence
+        step_m = config.probe_step_m
+        north_m, east_m = pose.north_m, pose.east_m
+
+        def along(azimuth_rad: float) -> Place:
+            return north_m + step_m * math.cos(azimuth_rad), east_m + step_m * math.sin(azimuth_rad)
+
+        free = evidence.seen.free_azimuths(step_m + config.step_margin_m, pose, evidence.speed_m_s, now_ns)
+        if free:
+            azimuth, _ = min(free, key=lambda item: abs(wrap_rad(item[0] - look_rad)))
+            return "seen free", along(azimuth)
+        back = evidence.track.back(north_m, east_m, step_m)
+        if back is not None:
+            azimuth = math.atan2(back[1] - east_m, back[0] - north_m)
+            return "flown track", along(azimuth)
+        blocked = evidence.free_m(look_rad, pose, now_ns) is not None
+        half_step = math.radians(config.turn_step_deg) / 2
+        used = self.episode is not None and self.episode.was_bootstrapped(look_rad, half_step)
+        if config.bootstrap_probe and not blocked and not used:
+            return "camera axis", along(look_rad)
+        return None
+
+    def _goal_bearing_rad(self, pose: Pose) -> float | None:
+        goal = self._evidence.goal.position
+        return None if goal is None else math.atan2(goal[1] - pose.east_m, goal[0] - pose.north_m)

@@ -102,6 +102,11 @@ def scale_end(magnitudes: NDArray[np.float64]) -> float:
     return float(np.percentile(magnitudes, _LENGTH_QUANTILE)) if len(magnitudes) else 0.0
 
 
+def scale_begin(magnitudes: NDArray[np.float64]) -> float:
+    """Return the magnitude up to which the first colour is used, where small ones are to be told apart; 0 where there is none."""
+    return float(np.percentile(magnitudes, 100.0 - _LENGTH_QUANTILE)) if len(magnitudes) else 0.0
+
+
 def candidate_roles(detection: Detection) -> list[tuple[tuple[float, float], CandidateRole]]:
     """Return each candidate with what the vote made of it; the one that it examined comes last."""
     diagnostics = detection.diagnostics

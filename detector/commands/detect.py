@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from detector.commands import inputs
-from detector.commands.inputs import InputError
 from detector.results import Detection, Direction, NoDetection
 
 if TYPE_CHECKING:
@@ -23,15 +21,8 @@ _DESCRIPTION: Final = """\
 Find the void (the way that is furthest from obstacles), or a single plane, in two frames of one camera that moved.
 """
 
-_EPILOG: Final = """\
-rotation file
-  The 3 x 3 rotation that takes coordinates of the earlier camera to those of the later one (x right, y down,
-  z forward), as TOML
-      later_from_earlier = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-  or as JSON
-      {"later_from_earlier": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
-  With camera-to-world rotations Ra and Rb it is transpose(Rb) Ra. It needs --hfov or --camera.
-
+_EPILOG: Final = f"""\
+{inputs.ROTATION_HELP}
 JSON keys
   kind        vanishing_point, lowest_flow, single_plane or none
   x_px, y_px  the direction, in the later frame; null unless kind is vanishing_point or lowest_flow
@@ -48,14 +39,6 @@ exit code
   2  the command line or a file that it names cannot be used; one line on stderr says which and why
 """
 
-_LEGIBLE_WIDTH_PX: Final = 480
-"""Narrower frames are plotted enlarged: text at their own size could not be read."""
-_ROTATION_TOLERANCE: Final = 1e-3
-"""Files hold rounded figures: R transpose(R) may differ from the identity by this much."""
-_LARGE: Final = 1e6
-"""No entry of anything like a rotation is as large; NaN and whole numbers too long for a float fail the comparison too."""
-_MAX_ZOOM: Final = 8
-
 
 def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of ``detector``."""
@@ -70,9 +53,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("later", type=Path, metavar="B", help="the later image")
     inputs.add_params_arguments(parser)
     inputs.add_camera_arguments(parser)
-    parser.add_argument(
-        "--rotation", type=Path, metavar="FILE", help="known rotation between the frames, see below"
-    )
+    inputs.add_rotation_argument(parser)
     parser.add_argument(
         "--baseline", type=inputs.metres, metavar="M", help="metres flown between the two frames"
     )
@@ -86,12 +67,8 @@ def _run(options: argparse.Namespace) -> int:
 
     params = inputs.params_of(options)
     earlier, later = inputs.read_image(options.earlier), inputs.read_image(options.later)
-    camera, rotation = inputs.camera_of(options, later.shape[1], later.shape[0]), None
-    if options.rotation is not None:
-        if options.hfov is None and options.camera is None:
-            raise InputError("--rotation: needs the camera too, as --hfov DEG or --camera FILE")
-        given = _read_rotation(options.rotation)
-        rotation = None if camera is None else given
+    camera = inputs.camera_of(options, later.shape[1], later.shape[0])
+    rotation = inputs.rotation_of(options, camera)
     result = VoidDetector(params).detect(earlier, later, camera=camera, later_from_earlier=rotation)
     if options.plot is not None:
         _plot(options.plot, later, result)
@@ -134,54 +111,6 @@ def as_dict(result: PairResult, baseline_m: float | None = None) -> dict[str, An
     return cleaned
 
 
-# ---------------------------------------------------------------------- input
-
-
-def _read_rotation(path: Path) -> NDArray[np.float64]:
-    import numpy as np
-
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not text in UTF-8") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {inputs.cause(error)}") from error
-    try:
-        table: Any = json.loads(text) if text.lstrip().startswith("{") else tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(inputs.one_line(f"{path}: is not valid TOML or JSON: {error}")) from error
-    if set(table) != {"later_from_earlier"}:
-        found = ", ".join(sorted(table)) or "no key"
-        raise InputError(inputs.one_line(f"{path}: found {found}, allowed is later_from_earlier alone"))
-    rows = table["later_from_earlier"]
-    is_matrix = isinstance(rows, list) and len(rows) == 3 and all(_is_row(row) for row in rows)
-    if not is_matrix:
-        raise InputError(
-            f"{path}: later_from_earlier: found {inputs.short(rows)}, allowed are 3 rows of 3 numbers"
-        )
-    rotation = np.array(rows, dtype=np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if not off <= _ROTATION_TOLERANCE:
-        raise InputError(
-            f"{path}: later_from_earlier: is not a rotation: rows must be of length 1 and perpendicular, they are off by {off:.3g}"
-        )
-    if np.linalg.det(rotation) < 0.0:
-        raise InputError(f"{path}: later_from_earlier: is a reflection, its determinant must be +1")
-    return rotation
-
-
-def _is_row(row: object) -> bool:
-    return (
-        isinstance(row, list)
-        and len(row) == 3
-        and all(
-            isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGE
-            for value in row
-        )
-    )
-
-
 # ---------------------------------------------------------------------- output
 
 
@@ -220,7 +149,6 @@ def _text(result: PairResult, answer: dict[str, Any]) -> str:
 
 
 def _plot(path: Path, later: NDArray[np.uint8], result: PairResult) -> None:
-    from detector.overlay import draw
+    from detector.overlay import draw, legible_zoom
 
-    zoom = min(max(1, round(_LEGIBLE_WIDTH_PX / later.shape[1])), _MAX_ZOOM)
-    inputs.write_picture("--plot", path, draw(later, result, zoom=zoom))
+    inputs.write_picture("--plot", path, draw(later, result, zoom=legible_zoom(later.shape[1])))

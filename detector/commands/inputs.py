@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,6 +17,21 @@ if TYPE_CHECKING:
     from detector.params import DetectorParams
 
 _MAX_BASELINE_M: Final = 1000.0
+_ROTATION_TOLERANCE: Final = 1e-3
+"""Files hold rounded figures: R transpose(R) may differ from the identity by this much."""
+_LARGE: Final = 1e6
+"""No entry of anything like a rotation is as large; NaN and whole numbers too long for a float fail the comparison too."""
+
+ROTATION_HELP: Final = """\
+rotation file
+  The 3 x 3 rotation that takes coordinates of the earlier camera to those of the later one (x right, y down,
+  z forward), as TOML
+      later_from_earlier = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+  or as JSON
+      {"later_from_earlier": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+  With camera-to-world rotations Ra and Rb it is transpose(Rb) Ra. It needs --hfov or --camera.
+"""
+"""What ``--help`` says of ``--rotation``."""
 
 
 class InputError(Exception):
@@ -42,6 +59,13 @@ def add_camera_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="TOML camera file: width_px, height_px, and hfov_deg or fx_px, fy_px, cx_px, cy_px, distortion",
+    )
+
+
+def add_rotation_argument(parser: argparse.ArgumentParser) -> None:
+    """Add ``--rotation``; :func:`rotation_of` reads it, :data:`ROTATION_HELP` describes it."""
+    parser.add_argument(
+        "--rotation", type=Path, metavar="FILE", help="known rotation between the frames, see below"
     )
 
 
@@ -90,6 +114,72 @@ def camera_of(options: argparse.Namespace, width_px: int, height_px: int) -> Cam
         prefix = "--hfov: " if options.hfov is not None else ""
         raise InputError(one_line(f"{prefix}{error}")) from error
     return camera
+
+
+def rotation_of(options: argparse.Namespace, camera: CameraModel | None) -> NDArray[np.float64] | None:
+    """Return the rotation that ``--rotation`` names; None where there is none, or no camera to use it with.
+
+    Raises
+    ------
+    InputError
+        It cannot be used, or neither ``--hfov`` nor ``--camera`` is given.
+    """
+    if options.rotation is None:
+        return None
+    if options.hfov is None and options.camera is None:
+        raise InputError("--rotation: needs the camera too, as --hfov DEG or --camera FILE")
+    given = read_rotation(options.rotation)
+    return None if camera is None else given
+
+
+def read_rotation(path: Path) -> NDArray[np.float64]:
+    """Return the rotation ``later_from_earlier`` that a TOML or JSON file holds, (3, 3).
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or holds no rotation.
+    """
+    import numpy as np
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text in UTF-8") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {cause(error)}") from error
+    try:
+        table: Any = json.loads(text) if text.lstrip().startswith("{") else tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(one_line(f"{path}: is not valid TOML or JSON: {error}")) from error
+    if set(table) != {"later_from_earlier"}:
+        found = ", ".join(sorted(table)) or "no key"
+        raise InputError(one_line(f"{path}: found {found}, allowed is later_from_earlier alone"))
+    rows = table["later_from_earlier"]
+    is_matrix = isinstance(rows, list) and len(rows) == 3 and all(_is_row(row) for row in rows)
+    if not is_matrix:
+        raise InputError(f"{path}: later_from_earlier: found {short(rows)}, allowed are 3 rows of 3 numbers")
+    rotation = np.array(rows, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not off <= _ROTATION_TOLERANCE:
+        raise InputError(
+            f"{path}: later_from_earlier: is not a rotation: rows must be of length 1 and perpendicular, they are off by {off:.3g}"
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise InputError(f"{path}: later_from_earlier: is a reflection, its determinant must be +1")
+    return rotation
+
+
+def _is_row(row: object) -> bool:
+    return (
+        isinstance(row, list)
+        and len(row) == 3
+        and all(
+            isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGE
+            for value in row
+        )
+    )
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from detector.drawing.palette import BLACK, WHITE, Colour, magnitude_colours
-from detector.drawing.text import put_text
+from detector.drawing.palette import BLACK, INK, WHITE, Colour, magnitude_colours
+from detector.drawing.text import put_text, text_size
 from detector.flow import Tracks
 
 Backdrop = Literal["dark", "light"]
@@ -59,10 +59,16 @@ class FrameCanvas:
         self._on_light = backdrop == "light"
 
     def flow(
-        self, tracks: Tracks, magnitudes: NDArray[np.float64], largest: float, *, thickness: int = 1
+        self,
+        tracks: Tracks,
+        magnitudes: NDArray[np.float64],
+        largest: float,
+        *,
+        smallest: float = 0.0,
+        thickness: int = 1,
     ) -> None:
-        """Draw flow vectors, each in the colour of its magnitude; those of ``largest`` and more in the last colour."""
-        colours = magnitude_colours(magnitudes, largest, on_light=self._on_light)
+        """Draw flow vectors, each in the colour of its magnitude (:func:`detector.drawing.palette.magnitude_colours`)."""
+        colours = magnitude_colours(magnitudes, largest, smallest=smallest, on_light=self._on_light)
         for start, end, (blue, green, red) in zip(tracks.start_px, tracks.end_px, colours, strict=True):
             self.vector(start, end, (int(blue), int(green), int(red)), thickness)
 
@@ -138,6 +144,21 @@ class FrameCanvas:
                 thickness=thickness * self.unit,
                 line_type=cv2.LINE_AA,
             )
+
+    def label(self, point: tuple[float, float], words: str, away: int) -> None:
+        """Write words beside a point, on white so that they can be read over anything."""
+        x, y = self._at(point)
+        scale = 0.6 * self.unit
+        width, height = text_size(words, scale, self.unit)
+        left = x + away * self.unit
+        if left + width + 4 > self.picture.shape[1]:
+            left = x - away * self.unit - width
+        pad = 3 * self.unit
+        corner = (left + width + pad, y + height // 2 + pad)
+        cv2.rectangle(self.picture, (left - pad, y - height // 2 - pad), corner, WHITE, thickness=cv2.FILLED)
+        put_text(
+            self.picture, words, (left, y), scale=scale, colour=INK, thickness=self.unit, anchor=(0.0, 0.5)
+        )
 
     def border(self, colour: Colour) -> None:
         """Draw a border round the picture."""

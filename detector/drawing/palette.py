@@ -34,9 +34,9 @@ _BRIGHT_END: Final = {False: 1.0, True: 0.82}
 
 
 def magnitude_colours(
-    magnitudes: NDArray[np.float64], largest: float, *, on_light: bool = False
+    magnitudes: NDArray[np.float64], largest: float, *, smallest: float = 0.0, on_light: bool = False
 ) -> NDArray[np.uint8]:
-    """Return the (N, 3) BGR colours of magnitudes: the plasma map, dark blue for 0 to orange or yellow for the largest.
+    """Return the (N, 3) BGR colours of magnitudes: the plasma map, dark blue for the smallest to orange or yellow for the largest.
 
     Parameters
     ----------
@@ -44,13 +44,15 @@ def magnitude_colours(
         (N,), not negative.
     largest
         This and more have the last colour.
+    smallest
+        This and less have the first.
     on_light
         For a light background: the map ends before yellow. On a dark one it begins behind its darkest blue.
     """
     if len(magnitudes) == 0:
         return np.zeros((0, 3), np.uint8)
     dark, bright = _DARK_END[on_light], _BRIGHT_END[on_light]
-    share = np.clip(np.asarray(magnitudes, np.float64) / max(largest, 1e-9), 0.0, 1.0)
+    share = np.clip((np.asarray(magnitudes, np.float64) - smallest) / max(largest - smallest, 1e-9), 0.0, 1.0)
     levels = np.round((dark + (bright - dark) * share) * 255.0).astype(np.uint8)
     colours = cv2.applyColorMap(levels.reshape(-1, 1), cv2.COLORMAP_PLASMA)
     return np.asarray(colours, np.uint8).reshape(-1, 3)

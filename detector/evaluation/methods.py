@@ -1,0 +1,194 @@
+"""Ways of answering a pair that can be judged side by side: the paper's, and trivial rivals that say what chance level is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector import lines, vanishing_point
+from detector.camera_model import CameraModel
+from detector.params import DetectorParams, scaled_px
+from detector.pipeline import VoidDetector
+from detector.results import Detection, Direction, NoDetection
+
+SINGLE_PLANE: Final = "single_plane"
+NONE: Final = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class PairInput:
+    """What a method is given.
+
+    Attributes
+    ----------
+    earlier, later
+        (H, W) uint8.
+    camera
+        None where it is not known.
+    later_from_earlier
+        (3, 3) rotation that takes coordinates of the earlier camera to those of the later one; None where not given.
+    translation_earlier_m
+        (3,) from the earlier to the later position, in the earlier camera's axes; None where not given.
+    """
+
+    earlier: NDArray[np.uint8]
+    later: NDArray[np.uint8]
+    camera: CameraModel | None = None
+    later_from_earlier: NDArray[np.float64] | None = None
+    translation_earlier_m: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a method says of a pair.
+
+    Attributes
+    ----------
+    kind
+        ``single_plane``, ``none``, or the name of what gave the direction.
+    point_px
+        The direction, x, y in the later frame; None unless the kind is a direction.
+    reason
+        Of ``none``.
+    contact_frames
+        Time to contact in steps of the pair's length, from the later frame.
+    focus_px
+        Focus of expansion in the later frame (without distortion) where the method *estimated* it; None where it was given.
+    """
+
+    kind: str
+    point_px: tuple[float, float] | None = None
+    reason: str | None = None
+    contact_frames: float | None = None
+    focus_px: tuple[float, float] | None = None
+
+
+class Method(Protocol):
+    """One way of answering."""
+
+    def answer(self, pair: PairInput, /) -> Answer:
+        """Return the answer to a pair."""
+        ...
+
+    def vanishing_point(self, image: NDArray[np.uint8], /) -> tuple[float, float] | None:
+        """Return what the method's lines alone say of one image; None where they say nothing."""
+        ...
+
+    def reset(self) -> None:
+        """Forget what was learned from earlier pairs."""
+        ...
+
+
+class _Lines:
+    """The line stage, which all methods share."""
+
+    def __init__(self, params: DetectorParams) -> None:
+        self._params = params
+
+    def vanishing_point(self, image: NDArray[np.uint8], /) -> tuple[float, float] | None:
+        return line_vanishing_point(image, self._params)
+
+    def reset(self) -> None:
+        """Nothing is kept."""
+
+
+class PaperMethod(_Lines):
+    """The detector (:class:`detector.pipeline.VoidDetector`)."""
+
+    def __init__(self, params: DetectorParams) -> None:
+        super().__init__(params)
+        self._detector = VoidDetector(params)
+
+    def answer(self, pair: PairInput, /) -> Answer:
+        """Return the detector's answer."""
+        result = self._detector.detect(
+            pair.earlier,
+            pair.later,
+            camera=pair.camera,
+            later_from_earlier=pair.later_from_earlier,
+            translation_earlier=pair.translation_earlier_m,
+        )
+        return answer_of(
+            result.detection, focus_px=None if pair.translation_earlier_m is not None else result.focus_px
+        )
+
+    def reset(self) -> None:
+        """Make the next pair a first loop."""
+        self._detector.reset()
+
+
+class StraightAhead(_Lines):
+    """Always the middle of the image: what a camera that is pointed where one wants to go would say."""
+
+    def answer(self, pair: PairInput, /) -> Answer:
+        """Return the middle of the later frame."""
+        height_px, width_px = pair.later.shape
+        return Answer("straight_ahead", (0.5 * (width_px - 1), 0.5 * (height_px - 1)))
+
+
+class LineVanishingPoint(_Lines):
+    """The vanishing point of the later frame, whatever the flow."""
+
+    def answer(self, pair: PairInput, /) -> Answer:
+        """Return the vanishing point."""
+        point_px = self.vanishing_point(pair.later)
+        return Answer(NONE, reason="no_vanishing_point") if point_px is None else Answer("line_vp", point_px)
+
+
+METHODS: Final[Mapping[str, Callable[[DetectorParams], Method]]] = MappingProxyType(
+    {"paper": PaperMethod, "straight": StraightAhead, "line_vp": LineVanishingPoint}
+)
+"""What ``--method`` can name."""
+
+
+def answer_of(detection: Detection, *, focus_px: tuple[float, float] | None = None) -> Answer:
+    """Return a detection as an answer."""
+    if isinstance(detection, NoDetection):
+        return Answer(NONE, reason=detection.reason.value, focus_px=focus_px)
+    contact = detection.time_to_contact
+    frames = None if contact is None else contact.frames
+    if isinstance(detection, Direction):
+        point_px = (detection.x_px, detection.y_px)
+        return Answer(detection.kind.value, point_px, contact_frames=frames, focus_px=focus_px)
+    return Answer(SINGLE_PLANE, contact_frames=frames, focus_px=focus_px)
+
+
+def line_vanishing_point(image: NDArray[np.uint8], params: DetectorParams) -> tuple[float, float] | None:
+    """Return the vanishing point that the paper's line stage (section 2.3) finds without any flow.
+
+    All lines form one group, about the middle of the image, since there are no clusters to assign them to.
+
+    Parameters
+    ----------
+    image
+        (H, W) uint8.
+    params
+        Its settings of edges, Hough transform and intersections.
+    """
+    height_px, width_px = image.shape
+    segments, _ = lines.lower_half_lines(
+        image,
+        lines.HoughSettings(
+            votes=max(1, round(scaled_px(params.hough_votes_at_1280, width_px))),
+            min_length_px=scaled_px(params.hough_min_length_px_at_1280, width_px),
+            max_gap_px=scaled_px(params.hough_max_gap_px_at_1280, width_px),
+        ),
+        lines.AngleGate(params.line_angle_min_deg, params.line_angle_max_deg, params.vertical_gap_deg),
+        edge_low=params.edge_low,
+        edge_high=params.edge_high,
+        wanted=params.lines_wanted,
+    )
+    found = vanishing_point.candidates(
+        segments,
+        np.array([[0.5 * (width_px - 1), 0.5 * (height_px - 1)]]),
+        (width_px, height_px),
+        pair_min_deg=params.pair_angle_min_deg,
+        pair_max_deg=params.pair_angle_max_deg,
+        cell_px=params.cell_px,
+    )
+    return (float(found[0, 0]), float(found[0, 1])) if len(found) else None

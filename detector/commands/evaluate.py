@@ -19,6 +19,7 @@ from detector.commands.inputs import InputError
 if TYPE_CHECKING:
     from detector.evaluation.dataset import ImageSet, Pair
     from detector.evaluation.run import Evaluation, Settings
+    from detector.params import DetectorParams
 
 _DESCRIPTION: Final = """\
 Judge the detector on folders of images against all that is known about them: directions, single planes, focus of expansion,
@@ -58,6 +59,14 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--method", default="paper", metavar="NAME", help="paper, straight or line_vp (default: %(default)s)"
     )
     inputs.add_params_arguments(parser)
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="changes",
+        metavar="KEY=VALUE",
+        help="replace one parameter; may be repeated",
+    )
     parser.add_argument(
         "--derotated", action="store_true", help="use b_derot, the later image turned back, in place of b"
     )
@@ -184,14 +193,38 @@ def _settings(options: argparse.Namespace) -> Settings:
 
     if options.method not in METHODS:
         raise InputError(f"--method: found {options.method!r}, allowed are {', '.join(METHODS)}")
+    changes = dict(_assignment("--set", text) for text in options.changes)
     return Settings(
         method=options.method,
         preset=options.preset,
-        params=inputs.params_of(options),
+        params=_with_changes("--set", inputs.params_of(options), changes),
         poses=options.poses,
         derotated=options.derotated,
         sequence=options.sequence,
     )
+
+
+def _with_changes(option: str, params: DetectorParams, changes: dict[str, Any]) -> DetectorParams:
+    from detector.params import DetectorParams, ParamsError
+
+    if not changes:
+        return params
+    try:
+        # Every field is given, so that the preset it starts from makes no difference.
+        return DetectorParams.preset("default", **{**params.model_dump(), **changes})
+    except ParamsError as error:
+        raise InputError(inputs.one_line(f"{option}: {error}".replace("preset default: ", ""))) from error
+
+
+def _assignment(option: str, text: str) -> tuple[str, Any]:
+    """Return KEY and VALUE, which is TOML; a bare word is a string."""
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise InputError(f"{option}: found {text!r}, needed is KEY=VALUE")
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
 
 
 def _other(
@@ -211,36 +244,21 @@ def _other(
 def _changed(options: argparse.Namespace, settings: Settings) -> Settings:
     from detector.evaluation.methods import METHODS
     from detector.evaluation.run import POSES
-    from detector.params import DetectorParams, ParamsError
 
-    changes: dict[str, Any] = {}
-    for text in options.compare:
-        key, _, value = text.partition("=")
-        changes[key.strip()] = _value(value.strip())
+    changes = dict(_assignment("--compare", text) for text in options.compare)
     for key, allowed in (("method", tuple(METHODS)), ("poses", POSES)):
         if key in changes and changes[key] not in allowed:
             raise InputError(f"--compare: {key}: found {changes[key]!r}, allowed are {', '.join(allowed)}")
     own = {key: changes.pop(key) for key in ("method", "poses", "preset") if key in changes}
-    try:
-        if "preset" in own:
-            again = argparse.Namespace(preset=own["preset"], params=options.params)
-            settings = dataclasses.replace(settings, params=inputs.params_of(again))
-        if changes:
-            known = settings.params.model_dump()
-            # Every field is known, so that the preset it starts from makes no difference.
-            params = DetectorParams.preset("default", **{**known, **changes})
-            settings = dataclasses.replace(settings, params=params)
-    except (ParamsError, InputError) as error:
-        raise InputError(inputs.one_line(f"--compare: {error}")) from error
-    return dataclasses.replace(settings, **own)
-
-
-def _value(text: str) -> Any:
-    """Return a value as TOML has it; a bare word is a string."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+    params = settings.params
+    if "preset" in own:
+        again = argparse.Namespace(preset=own["preset"], params=options.params)
+        try:
+            params = inputs.params_of(again)
+        except InputError as error:
+            raise InputError(f"--compare: {error}") from error
+        params = _with_changes("--set", params, dict(_assignment("--set", text) for text in options.changes))
+    return dataclasses.replace(settings, params=_with_changes("--compare", params, changes), **own)
 
 
 def _saved(path: Path) -> list[dict[str, Any]]:

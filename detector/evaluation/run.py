@@ -21,7 +21,7 @@ from detector.evaluation.bootstrap import share_interval
 from detector.evaluation.dataset import DatasetError, ImageSet, Pair
 from detector.evaluation.judgement import LineVerdict, Scene, Verdict, judge, judge_lines
 from detector.evaluation.methods import METHODS, NONE, SINGLE_PLANE, Method, PairInput
-from detector.params import DetectorParams
+from detector.params import DetectorParams, PresetName
 
 Poses = Literal["full", "rotation", "none"]
 ReadImage = Callable[[Path], NDArray[np.uint8]]
@@ -39,9 +39,9 @@ class Settings:
     method
         A name in :data:`detector.evaluation.methods.METHODS`.
     preset
-        Name of the parameters, for people.
+        What the parameters started from.
     params
-        The parameters themselves.
+        The parameters.
     poses
         What a method is told of the motion where it is known: rotation and translation, the rotation alone, or nothing.
     derotated
@@ -51,11 +51,17 @@ class Settings:
     """
 
     method: str
-    preset: str
+    preset: PresetName
     params: DetectorParams
     poses: Poses = "full"
     derotated: bool = False
     sequence: bool = False
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The parameters that are not the preset's."""
+        usual = DetectorParams.preset(self.preset).model_dump()
+        return {key: value for key, value in self.params.model_dump().items() if value != usual[key]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +166,7 @@ def summary(evaluation: Evaluation, *, seed: int = 0) -> dict[str, Any]:
         "name": evaluation.images.name,
         "method": settings.method,
         "preset": settings.preset,
+        "changes": settings.changes,
         "images": "derotated" if settings.derotated else "as_taken",
         "poses": told,
         "loops": "sequence" if settings.sequence else "first",

@@ -84,7 +84,7 @@ def _accuracy(summaries: Sequence[Record]) -> str:
             [
                 item["name"],
                 item["method"],
-                item["preset"],
+                _preset(item),
                 _told(item),
                 str(item["pairs"]),
                 _share(direction["right"], direction["with_truth"], direction["right_ci"]),
@@ -110,7 +110,7 @@ def _answers(summaries: Sequence[Record]) -> str:
         [
             item["name"],
             item["method"],
-            item["preset"],
+            _preset(item),
             _told(item),
             str(item["pairs"]),
             _counts(item["kinds"]),
@@ -125,6 +125,10 @@ def _answers(summaries: Sequence[Record]) -> str:
         ["set", "method", "preset", "told", "pairs", "answers", "reasons of none", "silent without motion"],
         rows,
     )
+
+
+def _preset(item: Record) -> str:
+    return ", ".join([item["preset"], *(f"{key}={value}" for key, value in item["changes"].items())])
 
 
 def _told(item: Record) -> str:

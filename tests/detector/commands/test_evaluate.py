@@ -15,7 +15,7 @@ from detector.cli import main
 PAIRS = Path(__file__).parents[2] / "data" / "pairs"
 OFFICE, BRICKS = PAIRS / "office", PAIRS / "brickwall"
 KEYS = {
-    "name", "method", "preset", "images", "poses", "loops", "pairs", "kinds", "reasons", "direction", "foe", "single_plane",
+    "name", "method", "preset", "changes", "images", "poses", "loops", "pairs", "kinds", "reasons", "direction", "foe", "single_plane",
     "no_motion", "vanishing_point", "time_to_contact", "seconds", "per_pair", "per_frame",
 }  # fmt: skip
 
@@ -113,6 +113,17 @@ def test_a_parameter_can_be_the_change(capsys):
     assert against["reasons"] == {"too_few_features_earlier": 5}
 
 
+def test_single_parameters_are_replaced_and_named(capsys, tmp_path):
+    (tmp_path / "params.toml").write_text("min_features = 100000\nseed = 3")
+    (office,) = evaluated(
+        capsys, OFFICE, "--params", tmp_path / "params.toml", "--set", "seed=0", "--compare", "preset=paper"
+    )
+    assert office["changes"] == {"min_features": 100000}
+    assert office["kinds"] == {"none": 5}
+    against = office["comparison"]["against"]
+    assert (against["preset"], against["changes"]) == ("paper", {"min_features": 100000})
+
+
 def test_files_are_written_and_can_be_compared_with_later(capsys, tmp_path):
     out = tmp_path / "made" / "here"
     code, text, err = run(capsys, OFFICE, "--method", "straight", "-o", out)
@@ -202,8 +213,10 @@ def test_a_grid_of_positions_has_answers_and_no_truth(capsys, tmp_path):
         (["{bricks}", "--min-baseline", "0.2"], "needs the pose of every frame"),
         (["{office}", "--min-baseline", "9"], "no two frames lie 9 m apart"),
         (["{office}", "--min-valid-frac", "0.99"], "no later depth image is known in a share of 0.99"),
-        (["{office}", "--compare", "best=1"], "--compare: preset default: best: unknown key"),
-        (["{office}", "--compare", "seed=x"], "--compare: preset default: seed: found 'x'"),
+        (["{office}", "--compare", "best=1"], "--compare: best: unknown key"),
+        (["{office}", "--compare", "seed=x"], "--compare: seed: found 'x'"),
+        (["{office}", "--set", "seed=x"], "--set: seed: found 'x'"),
+        (["{office}", "--set", "seed"], "--set: found 'seed', needed is KEY=VALUE"),
         (["{office}", "--compare", "preset=x"], "--compare: preset: found 'x'"),
         (["{office}", "--compare", "method=x"], "--compare: method: found 'x', allowed are paper"),
         (["{office}", "--compare", "poses=x"], "--compare: poses: found 'x', allowed are full"),

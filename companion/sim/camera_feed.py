@@ -13,7 +13,9 @@ import signal
 import socket
 import struct
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
@@ -22,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from companion.clock import Clock, RealClock
-from companion.errors import LinkError, SourceError
+from companion.errors import CompanionError, LinkError, SourceError
 from companion.guidance.coordinates import r_body_from_camera, r_ned_from_body
 from companion.guidance.observation import Pose
 from companion.sim.frame_server import Address, FrameServer
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 _POSE = struct.Struct("<q7d")
 _READY = b"ready "
 _FAILED = b"failed "
+_NO_SCENE = b"no-scene "
 _LONGEST_MESSAGE = 4096
 _STOP_S = 3.0
 
@@ -109,7 +112,7 @@ class CameraFeed:
     companion.errors.LinkError
         On entering, when the address cannot be had.
     companion.errors.SourceError
-        On entering, when the child process does not come up.
+        On entering, when the child process does not come up or cannot make the scene.
     """
 
     def __init__(
@@ -201,6 +204,8 @@ class CameraFeed:
             return host, int(port)
         if message.startswith(_FAILED):
             raise LinkError(message[len(_FAILED) :].decode())
+        if message.startswith(_NO_SCENE):
+            raise SourceError(message[len(_NO_SCENE) :].decode())
         raise SourceError("the camera process ended before it was ready; its traceback is above")
 
     async def _send_poses(self, ours: socket.socket) -> None:
@@ -243,24 +248,41 @@ def _run_child(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     poses.setblocking(False)
     with poses, contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the parent is gone
-        asyncio.run(_serve(poses, listen, scene(), camera, mount))
+        asyncio.run(_serve(poses, listen, scene, camera, mount))
 
 
 async def _serve(
-    poses: socket.socket, listen: Address, scene: Renderer, camera: CameraModel, mount: CameraMount
+    poses: socket.socket,
+    listen: Address,
+    make_scene: Callable[[], Renderer],
+    camera: CameraModel,
+    mount: CameraMount,
 ) -> None:
     loop = asyncio.get_running_loop()
     try:
-        async with FrameServer(listen) as server:
-            host, port = server.address
-            await loop.sock_sendall(poses, _READY + f"{host}:{port}".encode())
-            while message := await _newest(poses):
-                time_ns, north_m, east_m, down_m, *q = _POSE.unpack(message)
-                pose = Pose(time_ns, north_m, east_m, down_m, (q[0], q[1], q[2], q[3]))
-                image = await asyncio.to_thread(render_at, scene, camera, pose, mount)
-                server.publish(image, time_ns)
-    except LinkError as error:
-        await loop.sock_sendall(poses, _FAILED + str(error).encode()[: _LONGEST_MESSAGE - len(_FAILED)])
+        # One thread makes the scene and renders it: a graphics context belongs to the thread that made it.
+        with ThreadPoolExecutor(1, "renderer") as thread:
+            scene = await loop.run_in_executor(thread, make_scene)
+            await _serve_frames(poses, listen, partial(render_at, scene, camera, mount=mount), thread)
+    except CompanionError as error:
+        kind = _FAILED if isinstance(error, LinkError) else _NO_SCENE
+        await loop.sock_sendall(poses, kind + str(error).encode()[: _LONGEST_MESSAGE - len(kind)])
+
+
+async def _serve_frames(
+    poses: socket.socket,
+    listen: Address,
+    render: Callable[[Pose], NDArray[np.uint8]],
+    thread: ThreadPoolExecutor,
+) -> None:
+    loop = asyncio.get_running_loop()
+    async with FrameServer(listen) as server:
+        host, port = server.address
+        await loop.sock_sendall(poses, _READY + f"{host}:{port}".encode())
+        while message := await _newest(poses):
+            time_ns, north_m, east_m, down_m, *q = _POSE.unpack(message)
+            pose = Pose(time_ns, north_m, east_m, down_m, (q[0], q[1], q[2], q[3]))
+            server.publish(await loop.run_in_executor(thread, render, pose), time_ns)
 
 
 async def _newest(poses: socket.socket) -> bytes:

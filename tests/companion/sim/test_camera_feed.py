@@ -5,13 +5,14 @@ import functools
 import os
 import socket
 import struct
+import threading
 import time
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from companion.errors import LinkError, SourceError
+from companion.errors import CompanionError, LinkError, SourceError
 from companion.frames.socket import frame_bytes
 from companion.guidance.coordinates import quaternion_from_euler
 from companion.guidance.observation import Pose
@@ -167,6 +168,39 @@ async def test_a_scene_that_cannot_be_made_is_a_clear_error() -> None:
     with pytest.raises(SourceError, match="ended before it was ready"):
         async with CameraFeed(no_scene, CAMERA, lambda: Pose(0, 0, 0, 0, (1, 0, 0, 0))):
             pass
+
+
+def unusable_scene() -> _Broken:
+    raise CompanionError("this world has no floor")
+
+
+async def test_a_scene_that_says_why_it_cannot_be_made_is_that_error() -> None:
+    with pytest.raises(SourceError, match="this world has no floor"):
+        async with CameraFeed(unusable_scene, CAMERA, lambda: Pose(0, 0, 0, 0, (1, 0, 0, 0))):
+            pass
+
+
+class OneThread:
+    """Answers with a picture of whether it is used by the thread that made it, and by no other."""
+
+    def __init__(self) -> None:
+        self.thread = threading.get_ident()
+
+    def render(self, camera: CameraModel, position: ArrayLike, r: ArrayLike, /) -> NDArray[np.uint8]:
+        return np.full(
+            (camera.height_px, camera.width_px), 200 * (threading.get_ident() == self.thread), np.uint8
+        )
+
+
+async def test_a_scene_is_rendered_by_the_thread_that_made_it() -> None:
+    async with CameraFeed(
+        OneThread, CAMERA, lambda: Pose(time.monotonic_ns(), 0, 0, 0, (1, 0, 0, 0)), rate_hz=50
+    ) as feed:
+        reader, writer = await asyncio.open_connection(*feed.address)
+        for _ in range(5):
+            assert (await read_frame(reader))[0].min() == 200
+        writer.close()
+        await writer.wait_closed()
 
 
 async def test_a_port_in_use_is_a_clear_error() -> None:

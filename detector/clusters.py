@@ -1,19 +1,24 @@
-"""k-means over the flow field, its number of clusters, centre magnitudes and the single-plane test (paper section 2.2)."""
+"""k-means over the flow field, its number of clusters, centre magnitudes and the single-plane test (paper section 2.2).
+
+k-means and the two indices are scikit-learn's here. :mod:`detector.fast_clusters` has the same steps for the flight rate.
+scikit-learn is imported when it is first used: a worker that never needs it starts sooner and stays smaller.
+"""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.cluster import KMeans, kmeans_plusplus
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.metrics import calinski_harabasz_score, davies_bouldin_score
 
 Starts = Callable[[NDArray[np.float64], int], Sequence[NDArray[np.float64]]]
 """Given the samples and n, the (n, D) initial centres of each k-means run."""
+
+Quality = Callable[["Clustering"], float]
+"""How good a clustering is; larger is better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +52,7 @@ def samples_of(end_px: NDArray[np.float64], angles_deg: NDArray[np.float64]) -> 
 
 def seeded_starts(seed: int, restarts: int) -> Starts:
     """Return k-means++ starts drawn from ``seed``: the same samples and n always give the same starts."""
+    from sklearn.cluster import kmeans_plusplus
 
     def starts(samples: NDArray[np.float64], n: int) -> list[NDArray[np.float64]]:
         random = np.random.RandomState([seed % (1 << 32), n])
@@ -72,6 +78,9 @@ def kmeans(
     max_iterations
         Most rounds.
     """
+    from sklearn.cluster import KMeans
+    from sklearn.exceptions import ConvergenceWarning
+
     if len(samples) < len(initial):
         raise ValueError(f"expected at least as many samples as centres, got {len(samples)}, {len(initial)}")
     model = KMeans(len(initial), init=initial, n_init=1, max_iter=max_iterations, tol=0.0, algorithm="lloyd")
@@ -94,6 +103,8 @@ def best_of(samples: NDArray[np.float64], n: int, starts: Starts, max_iterations
 
 def calinski_harabasz(samples: NDArray[np.float64], clustering: Clustering) -> float:
     """Return the Calinski-Harabasz index: dispersion between over dispersion within; larger is better."""
+    from sklearn.metrics import calinski_harabasz_score
+
     if not _is_defined(samples, clustering):
         return 0.0
     return float(calinski_harabasz_score(samples, clustering.labels))
@@ -101,6 +112,8 @@ def calinski_harabasz(samples: NDArray[np.float64], clustering: Clustering) -> f
 
 def davies_bouldin(samples: NDArray[np.float64], clustering: Clustering) -> float:
     """Return the Davies-Bouldin index: mean over clusters of the worst (spread + spread) / distance; smaller is better."""
+    from sklearn.metrics import davies_bouldin_score
+
     if not _is_defined(samples, clustering):
         return 0.0
     return float(davies_bouldin_score(samples, clustering.labels))
@@ -112,6 +125,59 @@ def _is_defined(samples: NDArray[np.float64], clustering: Clustering) -> bool:
     return 2 <= used < len(samples)
 
 
+def quality_of(samples: NDArray[np.float64], clustering: Clustering) -> float:
+    """Return CH / DB; infinite where every sample lies on its centre, 0 where the indices are not defined.
+
+    The paper wants "the biggest CH and the lowest DB"; their quotient joins the two.
+    """
+    if not _is_defined(samples, clustering):
+        return 0.0
+    spread = davies_bouldin(samples, clustering)
+    return calinski_harabasz(samples, clustering) / spread if spread > 0.0 else math.inf
+
+
+def search_n(
+    cluster: Callable[[int], Clustering],
+    quality: Quality,
+    n_samples: int,
+    *,
+    n_min: int = 2,
+    n_max: int = 15,
+) -> Clustering:
+    """Return the clustering whose n has the best quality.
+
+    The smaller n wins a tie, and the first that leaves nothing within its clusters ends the search.
+
+    Parameters
+    ----------
+    cluster
+        Gives the clustering into n.
+    quality
+        CH / DB, see :func:`quality_of`.
+    n_samples
+        Number of samples: n stays below it.
+    n_min, n_max
+        Range of n.
+
+    Raises
+    ------
+    ValueError
+        With fewer than ``n_min + 1`` samples, for which no index is defined.
+    """
+    n_max = min(n_max, n_samples - 1)
+    if n_max < n_min:
+        raise ValueError(f"expected at least {n_min + 1} samples, got {n_samples}")
+    best, best_quality = cluster(n_min), -math.inf
+    for n in range(n_min, n_max + 1):
+        clustering = best if n == n_min else cluster(n)
+        found = quality(clustering)
+        if math.isinf(found):
+            return clustering  # every sample on its centre: no other n can be better
+        if found > best_quality:
+            best, best_quality = clustering, found
+    return best
+
+
 def choose_n(
     samples: NDArray[np.float64],
     starts: Starts,
@@ -120,30 +186,14 @@ def choose_n(
     n_max: int = 15,
     max_iterations: int = 300,
 ) -> Clustering:
-    """Return the clustering whose n has the largest CH / DB.
-
-    The paper wants "the biggest CH and the lowest DB"; their quotient joins the two. The smaller n wins a tie,
-    and the first that leaves nothing within its clusters ends the search.
-
-    Raises
-    ------
-    ValueError
-        With fewer than ``n_min + 1`` samples, for which no index is defined.
-    """
-    n_max = min(n_max, len(samples) - 1)
-    if n_max < n_min:
-        raise ValueError(f"expected at least {n_min + 1} samples, got {len(samples)}")
-    best: tuple[float, Clustering] | None = None
-    for n in range(n_min, n_max + 1):
-        clustering = best_of(samples, n, starts, max_iterations)
-        spread = davies_bouldin(samples, clustering)
-        if spread == 0.0 and _is_defined(samples, clustering):
-            return clustering  # every sample on its centre: no other n can be better
-        score = calinski_harabasz(samples, clustering) / spread if spread > 0.0 else 0.0
-        if best is None or score > best[0]:
-            best = (score, clustering)
-    assert best is not None  # noqa: S101 - the range above is not empty
-    return best[1]
+    """Return the clustering whose n has the largest CH / DB, by scikit-learn's k-means: :func:`search_n`."""
+    return search_n(
+        lambda n: best_of(samples, n, starts, max_iterations),
+        lambda clustering: quality_of(samples, clustering),
+        len(samples),
+        n_min=n_min,
+        n_max=n_max,
+    )
 
 
 def nearest_magnitudes(

@@ -53,7 +53,7 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.start_px)
 
-    def __getitem__(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Tracks:
+    def __getitem__(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Tracks:
         return Tracks(self.start_px[keep], self.end_px[keep])
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -30,11 +31,36 @@ class AngleGate:
     vertical_gap_deg: float = 0.0
 
 
+class Lines(NamedTuple):
+    """Segments of the lower half.
+
+    Attributes
+    ----------
+    segments_px
+        (K', 4) x1, y1, x2, y2 of those that pass the gate, in px of the full image.
+    found
+        K, the number before the gate.
+    votes
+        For the next frame.
+    """
+
+    segments_px: NDArray[np.float64]
+    found: int
+    votes: int
+
+
 def edges(lower_half: NDArray[np.uint8], low: float = 0.67, high: float = 1.33) -> NDArray[np.uint8]:
     """Return Canny edges after a 5 x 5 Gaussian blur, thresholds relative to the median grey of the region."""
-    median = float(np.median(lower_half))
+    median = _median_grey(lower_half)
     blurred = cv2.GaussianBlur(lower_half, (5, 5), 0)
     return np.asarray(cv2.Canny(blurred, low * median, high * median), dtype=np.uint8)
+
+
+def _median_grey(image: NDArray[np.uint8]) -> float:
+    """Return the median from the histogram: the same figure as by sorting, at a fraction of the time."""
+    up_to = np.cumsum(cv2.calcHist([image], [0], None, [256], [0.0, 256.0]), dtype=np.float64)
+    below, above = (image.size - 1) // 2, image.size // 2  # ranks of the middle, the same for an odd count
+    return 0.5 * float(np.searchsorted(up_to, below, "right") + np.searchsorted(up_to, above, "right"))
 
 
 def find_segments(edge_image: NDArray[np.uint8], top_px: int, settings: HoughSettings) -> NDArray[np.float64]:
@@ -80,7 +106,8 @@ def lower_half_lines(
     edge_low: float = 0.67,
     edge_high: float = 1.33,
     wanted: int = 0,
-) -> tuple[NDArray[np.float64], int]:
+    known_votes: int | None = None,
+) -> Lines:
     """Return the segments that pass the gate and the number found before it.
 
     Parameters
@@ -97,34 +124,46 @@ def lower_half_lines(
         0: votes fixed. Else: the largest number of votes for which at least ``wanted`` segments pass the gate. The
         paper tunes the transform by hand to reach about 10.
 
+    known_votes
+        The number that was right for the frame before. Then it is moved by an eighth where it no longer is, and the transform
+        runs once.
+
     Returns
     -------
-    (K', 4) segments in px of the full image, and K.
+    (K', 4) segments in px of the full image, K, and the votes that found them.
     """
     top = image.shape[0] // 2
     edge_image = edges(image[top:], edge_low, edge_high)
 
-    def with_votes(votes: int) -> tuple[NDArray[np.float64], int]:
+    def with_votes(votes: int) -> Lines:
         found = find_segments(
             edge_image, top, HoughSettings(votes, settings.min_length_px, settings.max_gap_px)
         )
-        return found[gate(found, gate_)], len(found)
+        return Lines(found[gate(found, gate_)], len(found), votes)
 
+    if wanted and known_votes is not None:
+        found = with_votes(known_votes)
+        step = max(1, known_votes // 8)
+        if len(found.segments_px) < wanted:
+            return found._replace(votes=max(_VOTES_MIN, known_votes - step))
+        if len(found.segments_px) > 2 * wanted:
+            return found._replace(votes=known_votes + step)
+        return found
     best = with_votes(settings.votes)
-    if wanted == 0 or len(best[0]) == wanted:
+    if wanted == 0 or len(best.segments_px) == wanted:
         return best
     # Fewer votes find more lines: bisect between what gives too few and what gives enough.
-    if len(best[0]) > wanted:
+    if len(best.segments_px) > wanted:
         low, high = settings.votes, max(settings.votes + 1, int(np.hypot(*edge_image.shape)))
     else:
         low, high = min(_VOTES_MIN, settings.votes), settings.votes
         best = with_votes(low)
-        if len(best[0]) <= wanted:
+        if len(best.segments_px) <= wanted:
             return best
     while high - low > max(1, low // 8):  # within an eighth is near enough, and each try costs a transform
         middle = (low + high) // 2
         tried = with_votes(middle)
-        if len(tried[0]) >= wanted:
+        if len(tried.segments_px) >= wanted:
             low, best = middle, tried
         else:
             high = middle

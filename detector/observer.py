@@ -29,7 +29,7 @@ from detector.expansion import (
     time_to_contact_along,
 )
 from detector.flow import Tracks, distribution_filter, track
-from detector.frame_quality import frame_fault
+from detector.frame import Frame, prepare
 from detector.params import DetectorParams, scaled_px
 from detector.pipeline import PairResult, VoidDetector
 from detector.results import (
@@ -127,8 +127,8 @@ class PairDetector(Protocol):
 
     def detect(
         self,
-        earlier: NDArray[np.uint8],
-        later: NDArray[np.uint8],
+        earlier: Frame,
+        later: Frame,
         *,
         camera: CameraModel | None = None,
         later_from_earlier: NDArray[np.float64] | None = None,
@@ -252,7 +252,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    image: NDArray[np.uint8]
+    frame: Frame
     time_ns: int
     pose: CameraPose | None
 
@@ -324,10 +324,10 @@ class VoidObserver:
             self._forget_scene()
         self._last_ns = time_ns
 
-        fault = frame_fault(image, self._params)
-        if fault is not None:
+        frame = prepare(image.copy(), self._params)  # the caller may use its image again
+        if frame.fault is not None:
             # Not kept: a frame that cannot be matched must not become a partner.
-            return _nothing(time_ns, fault.reason, fault.detail)
+            return _nothing(time_ns, frame.fault.reason, frame.fault.detail)
         camera = self._camera_for(image)
         if self._camera is not None and camera is None:
             height, width = image.shape
@@ -336,11 +336,11 @@ class VoidObserver:
                 NoDetectionReason.WRONG_SIZE,
                 f"found {width} x {height} px, the camera model is for {self._camera.width_px} x {self._camera.height_px}",
             )
-        if self._kept and self._kept[-1].image.shape != image.shape:
-            before = self._kept[-1].image.shape
+        if self._kept and self._kept[-1].frame.image.shape != image.shape:
+            before = self._kept[-1].frame.image.shape
             self.reset()
             self._last_ns = time_ns
-            self._keep(image, time_ns, pose)
+            self._keep(frame, time_ns, pose)
             return _nothing(
                 time_ns,
                 NoDetectionReason.WRONG_SIZE,
@@ -348,15 +348,15 @@ class VoidObserver:
             )
         self._note_scene(pose)
         partner = self._partner(image, time_ns, pose)
-        self._keep(image, time_ns, pose)
+        self._keep(frame, time_ns, pose)
         if isinstance(partner, NoDetection):
             return Observation(partner, time_ns)
-        return self._observe_pair(partner, image, time_ns, pose, camera)
+        return self._observe_pair(partner, frame, time_ns, pose, camera)
 
     def _observe_pair(
         self,
         earlier: _Kept,
-        image: NDArray[np.uint8],
+        later: Frame,
         time_ns: int,
         pose: CameraPose | None,
         camera: CameraModel | None,
@@ -371,8 +371,8 @@ class VoidObserver:
                 translation_earlier = earlier.pose.world_from_camera.T @ moved_m
                 translation_later = pose.world_from_camera.T @ moved_m
         result = self._detector.detect(
-            earlier.image,
-            image,
+            earlier.frame,
+            later,
             camera=camera,
             later_from_earlier=later_from_earlier,
             translation_earlier=translation_earlier,
@@ -489,7 +489,7 @@ class VoidObserver:
         best, best_flow_px, largest_px = None, math.inf, 0.0
         while low <= high:
             index = (low + high) // 2
-            flow_px = probe.median_flow_px(self._kept[index].image)
+            flow_px = probe.median_flow_px(self._kept[index].frame.image)
             if flow_px is None or flow_px >= target_px:
                 low = index + 1  # too far apart, or lost: try newer ones
             else:
@@ -507,10 +507,9 @@ class VoidObserver:
             NoDetectionReason.NO_MOTION, f"median flow {largest_px:.2f} px, at least {min_px:.2f} px needed"
         )
 
-    def _keep(self, image: NDArray[np.uint8], time_ns: int, pose: CameraPose | None) -> None:
+    def _keep(self, frame: Frame, time_ns: int, pose: CameraPose | None) -> None:
         """Keep the frame, thinned so that the ring spans a useful way and not just a moment."""
         params = self._observer_params
-        frame = _Kept(image.copy(), time_ns, pose)
         if len(self._kept) >= 2:
             # The newest one kept is provisional: it makes room unless it is a step beyond the one before.
             last, before = self._kept[-1], self._kept[-2]
@@ -523,7 +522,7 @@ class VoidObserver:
                 is_step = last.time_ns - before.time_ns >= params.max_age_s * 1e9 / params.max_frames
             if not is_step:
                 self._kept.pop()
-        self._kept.append(frame)
+        self._kept.append(_Kept(frame, time_ns, pose))
 
     def _note_scene(self, pose: CameraPose | None) -> None:
         if pose is None:

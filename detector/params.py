@@ -31,6 +31,37 @@ class DetectorParams(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
+    # ------------------------------------------------------------------ speed
+    speed: Annotated[
+        Literal["fast", "exact"],
+        Field(
+            description="exact: every key point of both frames, scikit-learn's k-means, as printed. fast: the same steps at flight rate, see the fast_ settings."
+        ),
+    ] = "fast"
+    fast_first_points: Annotated[
+        int,
+        Field(
+            ge=50,
+            le=100_000,
+            description="fast: most locations that the flow starts from in the first loop, which estimates p, n and k. Larger: slower, nearer to exact.",
+        ),
+    ] = 1000
+    fast_points: Annotated[
+        int,
+        Field(ge=50, le=100_000, description="fast: the same in the other loops."),
+    ] = 500
+    fast_tiles: Annotated[
+        int,
+        Field(
+            ge=1,
+            le=48,
+            description="fast: parts (of 48) of each frame that are looked at anew for key points. Larger: slower; new things come in sooner.",
+        ),
+    ] = 4
+    fast_restarts: Annotated[
+        int, Field(ge=1, le=100, description="fast: k-means runs for each n in the first loop.")
+    ] = 4
+
     # ------------------------------------------------------------------ frames
     min_width_px: Annotated[
         int, Field(ge=16, le=4096, description="Frames narrower than this are refused (wrong_size).")

@@ -15,11 +15,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from detector import clusters, expansion, flow, lines, outliers, vanishing_point, vote
+from detector import clusters, expansion, fast_clusters, flow, lines, outliers, vanishing_point, vote
 from detector.camera_model import CameraModel
-from detector.features import feature_locations
 from detector.flow import Tracks
-from detector.frame_quality import frame_fault
+from detector.frame import Frame, prepare
 from detector.params import DetectorParams, scaled_px
 from detector.results import (
     Detection,
@@ -32,12 +31,15 @@ from detector.results import (
     TimeToContact,
 )
 from detector.rotation import parallax_px
+from detector.seeds import SeedFinder
 
 Timer = Callable[[], float]
 
 _ASSUMED_HFOVS_DEG: Final = range(45, 111, 5)
 """Fields of view tried by the check on pure rotation where no camera is known: the one that explains most counts. Ten degrees
 beside the truth, a turn of 4 degrees leaves more flow behind than a camera's motion would."""
+_ROTATION_TRACKS: Final = 150
+"""fast: about so many vectors are asked whether the camera only turned."""
 _MIN_TRACKS: Final = 10
 """Fewer vectors than this say nothing about motion."""
 
@@ -114,15 +116,30 @@ class VoidDetector:
         self._p: int | None = None
         self._n: int | None = None
         self._k: int | None = None
+        self._seeds = SeedFinder(params)
+        self._centres: NDArray[np.float64] | None = None
+        self._votes: int | None = None
 
     def reset(self) -> None:
         """Forget p, n and k: the scene has changed, the next pair is a first loop."""
         self._p = self._n = self._k = None
+        self._centres = self._votes = None
+        self._seeds.reset()
+
+    def prepare(self, image: NDArray[np.uint8]) -> Frame:
+        """Return a frame for :meth:`detect`; in a stream, prepare each one once.
+
+        Raises
+        ------
+        ValueError
+            When the image is not (H, W) uint8.
+        """
+        return prepare(image, self.params)
 
     def detect(
         self,
-        earlier: NDArray[np.uint8],
-        later: NDArray[np.uint8],
+        earlier: NDArray[np.uint8] | Frame,
+        later: NDArray[np.uint8] | Frame,
         *,
         camera: CameraModel | None = None,
         later_from_earlier: NDArray[np.float64] | None = None,
@@ -133,7 +150,7 @@ class VoidDetector:
         Parameters
         ----------
         earlier, later
-            (H, W) uint8.
+            (H, W) uint8; or frames from :meth:`prepare`, which remember what was found in them for the next pairs.
         camera
             Needed to take a rotation out and to use a translation.
         later_from_earlier
@@ -146,25 +163,26 @@ class VoidDetector:
         ValueError
             When an image is not (H, W) uint8, or a rotation or translation comes without a camera.
         """
-        for name, image in (("earlier", earlier), ("later", later)):
-            if image.ndim != 2 or image.dtype != np.uint8:
-                raise ValueError(f"{name}: expected (H, W) uint8, got {image.shape} {image.dtype}")
         if camera is None and not (later_from_earlier is None and translation_earlier is None):
             raise ValueError("a rotation or translation needs a camera model")
         notes = _Notes(self._timer)
+        with notes.step("frames"):
+            earlier = self._frame("earlier", earlier)
+            later = self._frame("later", later)
         tracks = Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
         focus: NDArray[np.float64] | None = None
         try:
             self._check_frames(earlier, later, camera)
             points = self._features(earlier, later, notes)
-            raw, tracks = self._flow(earlier, later, points, camera, later_from_earlier, notes)
-            self._check_motion(raw, tracks, camera, later_from_earlier is not None, later.shape, notes)
+            raw, tracks = self._flow(earlier.image, later.image, points, camera, later_from_earlier, notes)
+            self._carry(later, raw, notes)
+            self._check_motion(raw, tracks, camera, later_from_earlier is not None, later.image.shape, notes)
             with notes.step("contact"):
                 focus = self._focus(tracks, camera, later_from_earlier, translation_earlier)
             if focus is not None:
                 notes.fields["focus_of_expansion_px"] = (float(focus[0]), float(focus[1]))
             kept = self._filter(tracks, notes)
-            detection = self._decide(later, kept, tracks, focus, camera, notes)
+            detection = self._decide(later.image, kept, tracks, focus, camera, notes)
         except _Stop as stop:
             detection = NoDetection(stop.reason, stop.detail, notes.diagnostics())
         at = None if focus is None else (float(focus[0]), float(focus[1]))
@@ -172,46 +190,79 @@ class VoidDetector:
 
     # ------------------------------------------------------------------ 2.1
 
-    def _check_frames(
-        self, earlier: NDArray[np.uint8], later: NDArray[np.uint8], camera: CameraModel | None
-    ) -> None:
-        if earlier.shape != later.shape:
+    def _frame(self, name: str, image: NDArray[np.uint8] | Frame) -> Frame:
+        if isinstance(image, Frame):
+            return image
+        try:
+            return self.prepare(image)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+
+    def _check_frames(self, earlier: Frame, later: Frame, camera: CameraModel | None) -> None:
+        shape = later.image.shape
+        if earlier.image.shape != shape:
             raise _Stop(
                 NoDetectionReason.WRONG_SIZE,
                 f"frames of {_size(earlier)} and {_size(later)}: they must be of one size",
             )
-        if camera is not None and later.shape != (camera.height_px, camera.width_px):
+        if camera is not None and shape != (camera.height_px, camera.width_px):
             raise _Stop(
                 NoDetectionReason.WRONG_SIZE,
                 f"frames of {_size(later)}, the camera model is for {camera.width_px} x {camera.height_px}",
             )
-        for name, image in (("earlier", earlier), ("later", later)):
-            fault = frame_fault(image, self.params)
-            if fault is not None:
-                raise _Stop(fault.reason, f"{name} frame: {fault.detail}")
+        for name, frame in (("earlier", earlier), ("later", later)):
+            if frame.fault is not None:
+                raise _Stop(frame.fault.reason, f"{name} frame: {frame.fault.detail}")
 
-    def _features(
-        self, earlier: NDArray[np.uint8], later: NDArray[np.uint8], notes: _Notes
-    ) -> NDArray[np.float32]:
-        params = self.params
+    def _features(self, earlier: Frame, later: Frame, notes: _Notes) -> NDArray[np.float32]:
+        """Return where the flow starts; stop where either frame holds too few key points."""
+        params, finder = self.params, self._seeds
         with notes.step("features"):
-            points, others = (
-                feature_locations(
-                    image,
-                    octave_layers=params.sift_octave_layers,
-                    contrast=params.sift_contrast,
-                    unique=params.unique_locations,
-                )
-                for image in (earlier, later)
-            )
-        notes.fields["n_features_earlier"], notes.fields["n_features_later"] = len(points), len(others)
-        for reason, found in (
-            (NoDetectionReason.TOO_FEW_FEATURES_EARLIER, points),
-            (NoDetectionReason.TOO_FEW_FEATURES_LATER, others),
+            if params.speed == "exact":
+                for frame in (earlier, later):
+                    if frame.seeds_px is None:
+                        frame.seeds_px = finder.all_of(frame.image)
+                        frame.n_features = len(frame.seeds_px)
+            elif earlier.seeds_px is None:
+                earlier.seeds_px, earlier.n_features = finder.find(earlier.image)
+            if later.n_features is None and self._n is None:
+                later.n_features = finder.count(later.image, params.min_features)
+        seeds = earlier.seeds_px
+        assert seeds is not None  # noqa: S101 - just found
+        notes.fields["n_features_earlier"] = earlier.n_features or 0
+        notes.fields["n_features_later"] = later.n_features or 0
+        for reason, frame in (
+            (NoDetectionReason.TOO_FEW_FEATURES_EARLIER, earlier),
+            (NoDetectionReason.TOO_FEW_FEATURES_LATER, later),
         ):
-            if len(found) < params.min_features:
-                raise _Stop(reason, f"{len(found)} key points, at least {params.min_features} needed")
-        return points
+            found = frame.n_features
+            if found is not None and found < params.min_features:
+                raise _Stop(reason, f"{found} key points, at least {params.min_features} needed")
+        return seeds
+
+    def _carry(self, later: Frame, tracks: Tracks, notes: _Notes) -> None:
+        """Let the vectors' ends be where the flow starts when the later frame is the earlier one.
+
+        In the other loops this is also where its key points are counted: those that were followed into it, and the new ones.
+        """
+        params = self.params
+        if params.speed == "exact" or later.seeds_px is not None:
+            return
+        with notes.step("features"):
+            later.seeds_px = self._seeds.renew(later.image, tracks.end_px)
+            if later.n_features is None:
+                renewed = 0 if later.seeds_px is None else len(later.seeds_px)
+                later.n_features = (
+                    renewed
+                    if renewed >= params.min_features
+                    else self._seeds.count(later.image, params.min_features)
+                )
+        notes.fields["n_features_later"] = later.n_features
+        if later.n_features < params.min_features:
+            raise _Stop(
+                NoDetectionReason.TOO_FEW_FEATURES_LATER,
+                f"{later.n_features} key points, at least {params.min_features} needed",
+            )
 
     # ------------------------------------------------------------------ 2.2
 
@@ -296,7 +347,9 @@ class VoidDetector:
                 if camera is None
                 else [camera]
             )
-            left_px = min(parallax_px(each, raw) for each in judged)
+            # A few hundred vectors tell as much as thousands.
+            few = raw[:: max(1, len(raw) // _ROTATION_TRACKS)] if params.speed == "fast" else raw
+            left_px = parallax_px(judged, few)
         limit_px = max(scaled_px(params.parallax_px_at_1280, width_px), params.still_flow_floor_px)
         if left_px < limit_px:
             raise _Stop(
@@ -398,19 +451,11 @@ class VoidDetector:
         """Return the (n, 2) cluster centres in the image and k; n and k are chosen in the first loop."""
         params = self.params
         samples = clusters.samples_of(kept.end_px, kept.angles_deg)
-        if self._n is None:
-            clustering = clusters.choose_n(
-                samples,
-                self._starts,
-                n_min=params.clusters_min,
-                n_max=params.clusters_max,
-                max_iterations=params.kmeans_iterations,
-            )
-            self._n = clustering.n
+        if params.speed == "exact":
+            clustering = self._exact_clustering(samples)
         else:
-            clustering = clusters.best_of(
-                samples, min(self._n, len(samples) - 1), self._starts, params.kmeans_iterations
-            )
+            clustering = self._fast_clustering(samples)
+        self._n, self._centres = self._n or clustering.n, clustering.centres
         centres = clustering.centres[:, :2]
         if self._k is None:
             self._k = clusters.choose_k(
@@ -422,6 +467,43 @@ class VoidDetector:
                 change=params.nearest_change,
             )
         return centres, self._k
+
+    def _exact_clustering(self, samples: NDArray[np.float64]) -> clusters.Clustering:
+        params = self.params
+        if self._n is None:
+            return clusters.choose_n(
+                samples,
+                self._starts,
+                n_min=params.clusters_min,
+                n_max=params.clusters_max,
+                max_iterations=params.kmeans_iterations,
+            )
+        return clusters.best_of(
+            samples, min(self._n, len(samples) - 1), self._starts, params.kmeans_iterations
+        )
+
+    def _fast_clustering(self, samples: NDArray[np.float64]) -> clusters.Clustering:
+        """Return the clustering by OpenCV's k-means; in the other loops from the centres of the pair before, or anew if that is better."""
+        params = self.params
+
+        def anew(n: int, attempts: int) -> clusters.Clustering:
+            return fast_clusters.kmeans(
+                samples, n, seed=params.seed, attempts=attempts, max_iterations=params.kmeans_iterations
+            )
+
+        if self._n is None:
+            return clusters.search_n(
+                lambda n: anew(n, params.fast_restarts),
+                lambda clustering: fast_clusters.quality_of(samples, clustering),
+                len(samples),
+                n_min=params.clusters_min,
+                n_max=params.clusters_max,
+            )
+        n = min(self._n, len(samples) - 1)
+        runs = [anew(n, 1)]
+        if self._centres is not None and len(self._centres) == n:
+            runs.append(fast_clusters.from_centres(samples, self._centres, params.kmeans_iterations))
+        return min(runs, key=lambda run: run.inertia)
 
     def _magnitudes(
         self, kept: Tracks, focus: NDArray[np.float64] | None, camera: CameraModel | None
@@ -447,14 +529,17 @@ class VoidDetector:
             max_gap_px=scaled_px(params.hough_max_gap_px_at_1280, width_px),
         )
         gate = lines.AngleGate(params.line_angle_min_deg, params.line_angle_max_deg, params.vertical_gap_deg)
-        segments, n_lines = lines.lower_half_lines(
+        segments, n_lines, votes = lines.lower_half_lines(
             later,
             settings,
             gate,
             edge_low=params.edge_low,
             edge_high=params.edge_high,
             wanted=params.lines_wanted,
+            known_votes=self._votes,
         )
+        if params.speed == "fast":
+            self._votes = votes
         found = vanishing_point.candidates(
             segments,
             centres,
@@ -506,5 +591,6 @@ class VoidDetector:
         return expansion.time_to_contact_along(start, end, focus, towards, gate_px)
 
 
-def _size(image: NDArray[np.uint8]) -> str:
-    return f"{image.shape[1]} x {image.shape[0]} px"
+def _size(frame: Frame) -> str:
+    height, width = frame.image.shape
+    return f"{width} x {height} px"

@@ -5,6 +5,8 @@ A turning camera sees no parallax: its flow says nothing of depth, however large
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,36 +25,44 @@ def fit_rotation(start_rays: NDArray[np.float64], end_rays: NDArray[np.float64])
     Parameters
     ----------
     start_rays, end_rays
-        (N, 3) unit rays of the same points, N >= 3.
+        (..., N, 3) unit rays of the same points, N >= 3; a fit for each of the leading indices.
 
     Returns
     -------
-    (3, 3) ``later_from_earlier``.
+    (..., 3, 3) ``later_from_earlier``.
     """
-    weights = np.ones(len(start_rays))
-    rotation = np.eye(3)
+    weights = np.ones((*start_rays.shape[:-1], 1))
+    rotation = np.broadcast_to(np.eye(3), (*start_rays.shape[:-2], 3, 3))
     for _ in range(_ROUNDS):
-        u, _, vt = np.linalg.svd((end_rays * weights[:, None]).T @ start_rays)
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
-        residual = np.linalg.norm(end_rays - start_rays @ rotation.T, axis=1)
-        weights = 1.0 / (1.0 + (residual / _SCALE_RAD) ** 2)
+        u, _, vt = np.linalg.svd((end_rays * weights).swapaxes(-1, -2) @ start_rays)
+        u[..., :, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[..., None]  # a rotation, not a reflection
+        rotation = u @ vt
+        away = end_rays - start_rays @ rotation.swapaxes(-1, -2)
+        weights = 1.0 / (1.0 + np.einsum("...i,...i->...", away, away)[..., None] / _SCALE_RAD**2)
     return rotation
 
 
-def parallax_px(camera: Camera, tracks: Tracks, *, percentile: float = 80.0) -> float:
+def parallax_px(cameras: Sequence[Camera], tracks: Tracks, *, percentile: float = 80.0) -> float:
     """Return the flow that the best pure rotation leaves, in px of the second frame.
 
     Parameters
     ----------
-    camera
-        Its field of view matters: towards the borders a turn's flow grows with the square of the angle from the axis.
+    cameras
+        One, or several where the field of view is not known: the one that explains most counts. It matters, since towards the borders
+        a turn's flow grows with the square of the angle from the axis.
     tracks
         Before any rotation is taken out.
     percentile
         Of the residual lengths; high, since near objects may be few.
     """
-    rotation = fit_rotation(camera.pixel_to_ray(tracks.start_px), camera.pixel_to_ray(tracks.end_px))
-    turned = camera.ray_to_pixel(camera.pixel_to_ray(tracks.start_px) @ rotation.T)
-    left = np.linalg.norm(tracks.end_px - turned, axis=1)
-    left = left[np.isfinite(left)]
-    return float(np.percentile(left, percentile)) if left.size else 0.0
+    start = np.stack([camera.pixel_to_ray(tracks.start_px) for camera in cameras])
+    end = np.stack([camera.pixel_to_ray(tracks.end_px) for camera in cameras])
+    turned = start @ fit_rotation(start, end).swapaxes(-1, -2)
+    left_px = [
+        np.linalg.norm(tracks.end_px - camera.ray_to_pixel(rays), axis=1)
+        for camera, rays in zip(cameras, turned, strict=True)
+    ]
+    return min(
+        float(np.percentile(left[np.isfinite(left)], percentile)) if np.isfinite(left).any() else 0.0
+        for left in left_px
+    )

@@ -31,7 +31,7 @@ def drawn(angle_deg: float, middle: tuple[int, int] = (240, 240), half_length_px
 
 @pytest.mark.parametrize("angle_deg", [45, 60, 75, 90, 105, 120, 135])
 def test_a_drawn_line_is_found_where_and_as_it_is(angle_deg: int) -> None:
-    found, total = lower_half_lines(drawn(angle_deg), SETTINGS, AngleGate())
+    found, total, _ = lower_half_lines(drawn(angle_deg), SETTINGS, AngleGate())
     assert 0 < len(found) <= total
     beta = angles_deg(found)
     assert np.abs(beta - angle_deg).max() < 3.0
@@ -42,7 +42,7 @@ def test_a_drawn_line_is_found_where_and_as_it_is(angle_deg: int) -> None:
 
 @pytest.mark.parametrize("angle_deg", [0, 20, 35, 145, 160])
 def test_flat_lines_are_found_and_left_out(angle_deg: int) -> None:
-    found, total = lower_half_lines(drawn(angle_deg), SETTINGS, AngleGate())
+    found, total, _ = lower_half_lines(drawn(angle_deg), SETTINGS, AngleGate())
     assert len(found) == 0
     assert total > 0
 
@@ -50,7 +50,7 @@ def test_flat_lines_are_found_and_left_out(angle_deg: int) -> None:
 def test_an_odd_height_begins_the_lower_half_at_the_lesser_row() -> None:
     image = np.full((321, 480), 90, np.uint8)
     image[160:, 200:] = 210
-    found, _ = lower_half_lines(image, SETTINGS, AngleGate())
+    found, *_ = lower_half_lines(image, SETTINGS, AngleGate())
     assert found[:, [1, 3]].min() >= 160
     assert found[:, [1, 3]].max() <= 320
     assert found[:, [1, 3]].max() >= 318
@@ -110,6 +110,6 @@ def test_the_gate_leaves_its_own_limits_out() -> None:
 
 def test_a_wanted_number_that_no_votes_reach_gives_all_there_is() -> None:
     image = drawn(60)
-    plenty, _ = lower_half_lines(image, HoughSettings(5, 30.0, 5.0), AngleGate())
-    wanted, _ = lower_half_lines(image, SETTINGS, AngleGate(), wanted=500)
+    plenty, *_ = lower_half_lines(image, HoughSettings(5, 30.0, 5.0), AngleGate())
+    wanted, *_ = lower_half_lines(image, SETTINGS, AngleGate(), wanted=500)
     np.testing.assert_array_equal(wanted, plenty)

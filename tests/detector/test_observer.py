@@ -12,6 +12,7 @@ from companion.guidance.coordinates import r_body_from_camera, r_from_euler
 from companion.sim.scene import Scene, room_with_wall
 from detector.camera_model import CameraModel
 from detector.flow import Tracks, derotate, distribution_filter, track
+from detector.frame import Frame
 from detector.observer import CameraPose, ObserverParams, VoidObserver
 from detector.params import DetectorParams
 from detector.results import Diagnostics, NoDetection, NoDetectionReason, SinglePlane
@@ -35,7 +36,8 @@ class _Tracker:
     resets: int = 0
     reason: NoDetectionReason | None = None
 
-    def detect(self, earlier: np.ndarray, later: np.ndarray, **given: Any) -> _Result:
+    def detect(self, earlier_frame: Frame, later_frame: Frame, **given: Any) -> _Result:
+        earlier, later = earlier_frame.image, later_frame.image
         self.calls.append({"earlier": earlier, "later": later, **given})
         start = cv2.goodFeaturesToTrack(earlier, 500, 0.005, 4).reshape(-1, 2)
         rotation, camera = given["later_from_earlier"], given["camera"]

@@ -52,7 +52,7 @@ def test_coplanar_points_never_give_a_mirror() -> None:
 def test_a_turn_leaves_no_parallax(x: float, y: float, z: float) -> None:
     start = np.random.default_rng(1).uniform([120, 100], [520, 380], (150, 2))
     end = derotate(start, CAMERA, rotation_of(x, y, z))
-    assert parallax_px(CAMERA, Tracks(start, end)) < 1e-5
+    assert parallax_px([CAMERA], Tracks(start, end)) < 1e-5
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.03, -0.06, 0.02)])
@@ -63,12 +63,12 @@ def test_moving_ahead_leaves_parallax_with_and_without_a_turn(turn: tuple[float,
     points = before / before[:, 2:] * depth_m[:, None]
     start = CAMERA.ray_to_pixel(points)
     end = CAMERA.ray_to_pixel((points - [0.0, 0.0, 0.3]) @ rotation_of(*turn).T)
-    left = parallax_px(CAMERA, Tracks(start, end))
+    left = parallax_px([CAMERA], Tracks(start, end))
     truth = np.linalg.norm(CAMERA.ray_to_pixel(points - [0.0, 0.0, 0.3]) - start, axis=1)
     assert left == pytest.approx(np.percentile(truth, 80), rel=0.25)
-    assert parallax_px(CAMERA, Tracks(start, end), percentile=20.0) < left
+    assert parallax_px([CAMERA], Tracks(start, end), percentile=20.0) < left
 
 
 def test_points_that_a_turn_takes_behind_the_camera_do_not_count() -> None:
     start = np.array([[320.0, 240.0], [0.0, 240.0], [639.0, 240.0], [320.0, 0.0]])
-    assert np.isfinite(parallax_px(CAMERA, Tracks(start, start[::-1].copy())))
+    assert np.isfinite(parallax_px([CAMERA], Tracks(start, start[::-1].copy())))

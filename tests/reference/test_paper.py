@@ -66,6 +66,7 @@ def params_of(preset: PresetName) -> DetectorParams:
         rotation_check=False,
         depth_cue="flow",
         blur_limit=1.0,
+        speed="exact",
         kmeans_restarts=2 if preset == "paper" else 1,
     )
 

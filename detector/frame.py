@@ -1,0 +1,54 @@
+"""A frame and what is worked out about it once, though it is the later frame of one pair and the earlier one of others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.frame_quality import FrameFault, frame_fault
+from detector.params import DetectorParams
+
+
+@dataclass(slots=True)
+class Frame:
+    """One frame.
+
+    Attributes
+    ----------
+    image
+        (H, W) uint8. Kept, not copied: it must not change any more.
+    fault
+        Why it cannot be used, if so.
+    seeds_px
+        (N, 2) where the flow starts when this is the earlier frame: found when first needed, or carried over from
+        the pair that it was the later frame of. None where nothing is known yet.
+    n_features
+        How many key points were found, before any cap. None where nobody has looked.
+    """
+
+    image: NDArray[np.uint8]
+    fault: FrameFault | None
+    seeds_px: NDArray[np.float32] | None = None
+    n_features: int | None = None
+
+
+def prepare(image: NDArray[np.uint8], params: DetectorParams) -> Frame:
+    """Return a frame with its quality judged.
+
+    Parameters
+    ----------
+    image
+        (H, W) uint8.
+    params
+        Limits.
+
+    Raises
+    ------
+    ValueError
+        When the image is not (H, W) uint8.
+    """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise ValueError(f"expected (H, W) uint8, got {image.shape} {image.dtype}")
+    return Frame(image, frame_fault(image, params))

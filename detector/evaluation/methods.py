@@ -171,7 +171,7 @@ def line_vanishing_point(image: NDArray[np.uint8], params: DetectorParams) -> tu
         Its settings of edges, Hough transform and intersections.
     """
     height_px, width_px = image.shape
-    segments, _ = lines.lower_half_lines(
+    segments, *_ = lines.lower_half_lines(
         image,
         lines.HoughSettings(
             votes=max(1, round(scaled_px(params.hough_votes_at_1280, width_px))),

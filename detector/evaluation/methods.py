@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final, Protocol
 
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from detector import lines, vanishing_point
 from detector.camera_model import CameraModel
+from detector.expansion import fit_focus_of_expansion, ideal_px
+from detector.flow import Tracks
 from detector.params import DetectorParams, scaled_px
 from detector.pipeline import VoidDetector
 from detector.results import Detection, Direction, NoDetection
@@ -59,6 +61,9 @@ class Answer:
         Time to contact in steps of the pair's length, from the later frame.
     focus_px
         Focus of expansion in the later frame (without distortion) where the method *estimated* it; None where it was given.
+    tracks
+        The flow vectors behind the answer, rotation taken out where it was given. Where the method was told the focus they still say what it would
+        have found.
     """
 
     kind: str
@@ -66,6 +71,7 @@ class Answer:
     reason: str | None = None
     contact_frames: float | None = None
     focus_px: tuple[float, float] | None = None
+    tracks: Tracks | None = field(default=None, compare=False, repr=False)
 
 
 class Method(Protocol):
@@ -113,9 +119,8 @@ class PaperMethod(_Lines):
             later_from_earlier=pair.later_from_earlier,
             translation_earlier=pair.translation_earlier_m,
         )
-        return answer_of(
-            result.detection, focus_px=None if pair.translation_earlier_m is not None else result.focus_px
-        )
+        told = pair.translation_earlier_m is not None
+        return answer_of(result.detection, focus_px=None if told else result.focus_px, tracks=result.tracks)
 
     def reset(self) -> None:
         """Make the next pair a first loop."""
@@ -146,16 +151,29 @@ METHODS: Final[Mapping[str, Callable[[DetectorParams], Method]]] = MappingProxyT
 """What ``--method`` can name."""
 
 
-def answer_of(detection: Detection, *, focus_px: tuple[float, float] | None = None) -> Answer:
+def answer_of(
+    detection: Detection, *, focus_px: tuple[float, float] | None = None, tracks: Tracks | None = None
+) -> Answer:
     """Return a detection as an answer."""
     if isinstance(detection, NoDetection):
-        return Answer(NONE, reason=detection.reason.value, focus_px=focus_px)
+        return Answer(NONE, reason=detection.reason.value, focus_px=focus_px, tracks=tracks)
     contact = detection.time_to_contact
     frames = None if contact is None else contact.frames
     if isinstance(detection, Direction):
         point_px = (detection.x_px, detection.y_px)
-        return Answer(detection.kind.value, point_px, contact_frames=frames, focus_px=focus_px)
-    return Answer(SINGLE_PLANE, contact_frames=frames, focus_px=focus_px)
+        return Answer(detection.kind.value, point_px, None, frames, focus_px, tracks)
+    return Answer(SINGLE_PLANE, None, None, frames, focus_px, tracks)
+
+
+def with_focus(answer: Answer, camera: CameraModel | None) -> Answer:
+    """Return an answer with the focus of expansion that its flow vectors say, where the method estimated none."""
+    if answer.focus_px is not None or answer.tracks is None:
+        return answer
+    start, end = answer.tracks.start_px, answer.tracks.end_px
+    if camera is not None:
+        start, end = ideal_px(camera, start), ideal_px(camera, end)
+    focus = fit_focus_of_expansion(start, end)
+    return answer if focus is None else replace(answer, focus_px=(float(focus[0]), float(focus[1])))
 
 
 def line_vanishing_point(image: NDArray[np.uint8], params: DetectorParams) -> tuple[float, float] | None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from detector.evaluation.bootstrap import share_interval
 from detector.evaluation.dataset import DatasetError, ImageSet, Pair
 from detector.evaluation.judgement import LineVerdict, Scene, Verdict, judge, judge_lines
-from detector.evaluation.methods import METHODS, NONE, SINGLE_PLANE, Method, PairInput
+from detector.evaluation.methods import METHODS, NONE, SINGLE_PLANE, Method, PairInput, with_focus
 from detector.params import DetectorParams, PresetName
 
 Poses = Literal["full", "rotation", "none"]
@@ -242,7 +242,7 @@ def _judge_pair(
         later_contact_s=frame_b.time_to_contact_s,
         turned_back=settings.derotated,
     )
-    return judge(answer, pair, scene, seconds)
+    return judge(with_focus(answer, images.camera), pair, scene, seconds)
 
 
 def _line_frames(images: ImageSet, pairs: Sequence[Pair]) -> list[str]:

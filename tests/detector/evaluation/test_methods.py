@@ -8,7 +8,14 @@ import pytest
 
 from detector.camera_model import CameraModel
 from detector.evaluation.dataset import load_truth
-from detector.evaluation.methods import METHODS, PairInput, PaperMethod, answer_of, line_vanishing_point
+from detector.evaluation.methods import (
+    METHODS,
+    PairInput,
+    PaperMethod,
+    answer_of,
+    line_vanishing_point,
+    with_focus,
+)
 from detector.params import DetectorParams
 from detector.pipeline import VoidDetector
 from detector.results import Diagnostics, Direction, DirectionKind, NoDetection, NoDetectionReason
@@ -70,9 +77,12 @@ def test_a_focus_that_was_given_is_not_an_estimate():
     assert motion is not None
     images = [cv2.imread(str(office.folder / name), cv2.IMREAD_GRAYSCALE) for name in (pair.a, pair.b)]
     told = PairInput(*images, office.camera, motion.later_from_earlier, motion.translation_earlier_m)
-    assert PaperMethod(PARAMS).answer(told).focus_px is None
+    with_translation = PaperMethod(PARAMS).answer(told)
+    assert with_translation.focus_px is None
     turned = PairInput(*images, office.camera, motion.later_from_earlier)
-    assert PaperMethod(PARAMS).answer(turned).focus_px is not None
+    estimated = PaperMethod(PARAMS).answer(turned).focus_px
+    assert estimated is not None
+    assert with_focus(with_translation, office.camera).focus_px == estimated
 
 
 def test_silence_keeps_its_reason():

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from detector.commands import detect, evaluate
+from detector.commands import detect, evaluate, report, video
 from detector.commands.inputs import InputError
 
 EXIT_BAD_INPUT: Final = 2
@@ -46,6 +46,6 @@ def _parser() -> argparse.ArgumentParser:
         description="Void detection for indoor drones, from optical flow and vanishing points of one camera.",
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (detect, evaluate):
+    for command in (detect, evaluate, report, video):
         command.add(commands)
     return parser

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.drawing.frame import FrameCanvas
-from detector.drawing.palette import BLUE, GREEN, ORANGE, RED, WHITE, YELLOW
+from detector.drawing.palette import BLUE, GREEN, ORANGE, RED, SKY, WHITE, YELLOW
 from detector.pipeline import PairResult
 from detector.results import Detection, Diagnostics, Direction, DirectionKind, NoDetection, SinglePlane
 
@@ -19,6 +19,7 @@ _LENGTH_QUANTILE: Final = 95.0
 _LEGIBLE_WIDTH_PX: Final = 480
 """Narrower frames are drawn enlarged: text at their own size could not be read."""
 _MAX_ZOOM: Final = 8
+_CANDIDATE: Final = 8
 
 
 class CandidateRole(StrEnum):
@@ -39,7 +40,7 @@ def draw(
 
     ============================  ===============================================
     flow vectors N'               dark blue (short) over purple to yellow (long)
-    lines behind the angle gate   orange
+    lines behind the angle gate   light blue
     cluster centres               green dots
     LMCC                          yellow disc
     candidates                    elected: white square; examined and rejected: red square, crossed out; others: blue diamond
@@ -76,7 +77,7 @@ def draw(
     lengths = result.tracks.lengths_px
     canvas.flow(result.tracks, lengths, scale_end(lengths))
     for x1, y1, x2, y2 in diagnostics.lines_px:
-        canvas.line((x1, y1), (x2, y2), ORANGE)
+        canvas.line((x1, y1), (x2, y2), SKY)
     for point in diagnostics.centre_points_px:
         canvas.disc(point, 4, GREEN)
     draw_candidates(canvas, detection)
@@ -124,11 +125,11 @@ def draw_candidates(canvas: FrameCanvas, detection: Detection) -> None:
     """Mark the vanishing-point candidates, each by its role."""
     for point, role in candidate_roles(detection):
         if role is CandidateRole.VALID:
-            canvas.diamond(point, 6, BLUE)
+            canvas.diamond(point, _CANDIDATE, BLUE)
         elif role is CandidateRole.REJECTED:
-            canvas.square(point, 6, RED, crossed_out=True)
+            canvas.square(point, _CANDIDATE, RED, crossed_out=True)
         else:
-            canvas.square(point, 6, WHITE)
+            canvas.square(point, _CANDIDATE, WHITE)
 
 
 def headline(detection: Detection) -> str:

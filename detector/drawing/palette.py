@@ -22,6 +22,8 @@ YELLOW: Final[Colour] = (0, 235, 255)
 RED: Final[Colour] = (60, 60, 255)
 BLUE: Final[Colour] = (255, 130, 30)
 ORANGE: Final[Colour] = (40, 160, 255)
+SKY: Final[Colour] = (255, 225, 80)
+"""Of lines: the scale of magnitudes has nothing like it."""
 
 # In charts: Okabe and Ito, "Color Universal Design", 2008.
 CHART_BLUE: Final[Colour] = (178, 114, 0)

@@ -59,12 +59,12 @@ def test_lmcc_centres_candidates_and_lines_are_drawn_in_their_colours():
     picture = draw(GREY, result(found))
     assert tuple(picture[200, 60]) == (60, 220, 60)  # a centre, green
     assert tuple(picture[120, 120]) == (0, 235, 255)  # LMCC, yellow
-    assert tuple(picture[160, 104]) == (255, 255, 255)  # the elected candidate, white
-    assert tuple(picture[220, 300 - 8]) == (255, 130, 30)  # another one, blue, a diamond
-    assert tuple(picture[120, 20]) == (40, 160, 255)  # a line, orange
+    assert tuple(picture[160, 102]) == (255, 255, 255)  # the elected candidate, white
+    assert tuple(picture[220, 300 - 10]) == (255, 130, 30)  # another one, blue, a diamond
+    assert tuple(picture[120, 20]) == (255, 225, 80)  # a line, light blue
     rejected = Direction(200, 150, DirectionKind.LOWEST_FLOW, None, found.diagnostics)
     crossed_out = draw(GREY, result(rejected))
-    assert tuple(crossed_out[160, 104]) == (60, 60, 255)  # examined, not elected: red
+    assert tuple(crossed_out[160, 102]) == (60, 60, 255)  # examined, not elected: red
     assert tuple(crossed_out[160, 110]) == (60, 60, 255)  # and crossed out, for who does not see red
     assert tuple(picture[160, 110]) != (60, 60, 255)
 

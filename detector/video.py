@@ -1,0 +1,201 @@
+"""A clip, frame by frame: the answer on each, and the annotated picture of it."""
+
+from __future__ import annotations
+
+import re
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.camera_model import CameraModel
+from detector.flow import Tracks
+from detector.frame import Frame
+from detector.observer import CameraPose, Observation, VoidObserver
+from detector.overlay import draw, legible_zoom
+from detector.params import DetectorParams
+from detector.pipeline import PairResult, VoidDetector
+from detector.results import Diagnostics, NoDetection, NoDetectionReason
+
+_DIGITS: Final = re.compile(r"(\d+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """What is known after one frame of a clip.
+
+    Attributes
+    ----------
+    observation
+        The answer, its times and its baseline.
+    tracks
+        The N' vectors behind it; empty where no pair was looked at.
+    """
+
+    observation: Observation
+    tracks: Tracks
+
+    @property
+    def result(self) -> PairResult:
+        """The answer with its tracks, for drawing."""
+        return PairResult(self.observation.detection, self.tracks, None)
+
+
+FrameAnswerer = Callable[[NDArray[np.uint8], int, CameraPose | None], Answered]
+"""Takes the next frame (H, W) uint8, its time in ns and its pose, if known."""
+
+
+def by_observer(params: DetectorParams, camera: CameraModel | None) -> FrameAnswerer:
+    """Return what answers as a vehicle does: the partner of each frame is chosen by the distance flown, else by the median flow."""
+    recorder = _Recorder(VoidDetector(params))
+    observer = VoidObserver(params, camera, detector=recorder)
+
+    def answer(image: NDArray[np.uint8], time_ns: int, pose: CameraPose | None) -> Answered:
+        recorder.tracks = _no_tracks()
+        observation = observer.observe(image, time_ns, pose)
+        return Answered(observation, recorder.tracks)
+
+    return answer
+
+
+def by_fixed_step(params: DetectorParams, camera: CameraModel | None, step: int) -> FrameAnswerer:
+    """Return what pairs each frame with the one ``step`` frames before it.
+
+    Parameters
+    ----------
+    params, camera
+        Of the detector.
+    step
+        1 pairs neighbours.
+
+    Raises
+    ------
+    ValueError
+        For a step below 1.
+    """
+    if step < 1:
+        raise ValueError(f"step: expected 1 or more, got {step}")
+    detector = VoidDetector(params)
+    kept: deque[tuple[Frame, int, CameraPose | None]] = deque(maxlen=step)
+
+    def answer(image: NDArray[np.uint8], time_ns: int, pose: CameraPose | None) -> Answered:
+        later = detector.prepare(image.copy())
+        earlier = kept[0] if len(kept) == step else None
+        kept.append((later, time_ns, pose))
+        if earlier is None:
+            words = f"frame {len(kept)} of the first {step}"
+            nothing = NoDetection(NoDetectionReason.NO_EARLIER_FRAME, words, Diagnostics())
+            return Answered(Observation(nothing, time_ns), _no_tracks())
+        frame, earlier_ns, earlier_pose = earlier
+        rotation = translation = baseline_m = None
+        if pose is not None and earlier_pose is not None:
+            moved_m = pose.position_m - earlier_pose.position_m
+            baseline_m = float(np.linalg.norm(moved_m))
+            if camera is not None:
+                rotation = pose.world_from_camera.T @ earlier_pose.world_from_camera
+                translation = earlier_pose.world_from_camera.T @ moved_m
+        result = detector.detect(
+            frame, later, camera=camera, later_from_earlier=rotation, translation_earlier=translation
+        )
+        return Answered(Observation(result.detection, time_ns, earlier_ns, baseline_m), result.tracks)
+
+    return answer
+
+
+class _Recorder:
+    """A detector that remembers the tracks of the pair it last saw."""
+
+    def __init__(self, detector: VoidDetector) -> None:
+        self._detector = detector
+        self.tracks = _no_tracks()
+
+    def detect(
+        self,
+        earlier: Frame,
+        later: Frame,
+        *,
+        camera: CameraModel | None = None,
+        later_from_earlier: NDArray[np.float64] | None = None,
+        translation_earlier: NDArray[np.float64] | None = None,
+    ) -> PairResult:
+        result = self._detector.detect(
+            earlier,
+            later,
+            camera=camera,
+            later_from_earlier=later_from_earlier,
+            translation_earlier=translation_earlier,
+        )
+        self.tracks = result.tracks
+        return result
+
+    def reset(self) -> None:
+        self._detector.reset()
+
+
+def _no_tracks() -> Tracks:
+    return Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+def annotated(image: NDArray[np.uint8], answered: Answered, number: int, time_s: float) -> NDArray[np.uint8]:
+    """Return a frame with its answer, its number and time and how far its partner lies back.
+
+    Parameters
+    ----------
+    image
+        (H, W) uint8; small ones are enlarged until the text can be read.
+    answered
+        The answer on it.
+    number, time_s
+        Of the frame in its clip.
+
+    Returns
+    -------
+    (H', W', 3) uint8, BGR, both sides even: video codecs need it.
+    """
+    observation = answered.observation
+    words = f"frame {number}  {time_s:.2f} s"
+    if observation.earlier_time_ns is not None:
+        words += f"  pair over {(observation.time_ns - observation.earlier_time_ns) * 1e-9:.2f} s"
+    if observation.baseline_m is not None:
+        words += f", {observation.baseline_m:.2f} m"
+    picture = draw(image, answered.result, zoom=legible_zoom(image.shape[1]), notes=(words,))
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def fitted(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return the picture at a width and height, whole and in proportion, on black.
+
+    Parameters
+    ----------
+    picture
+        (H, W, 3) uint8.
+    size_px
+        Width and height wanted.
+    """
+    width, height = size_px
+    if picture.shape[:2] == (height, width):
+        return picture
+    scale = min(width / picture.shape[1], height / picture.shape[0])
+    inner = (
+        min(width, max(1, round(picture.shape[1] * scale))),
+        min(height, max(1, round(picture.shape[0] * scale))),
+    )
+    whole = np.zeros((height, width, 3), np.uint8)
+    left, top = (width - inner[0]) // 2, (height - inner[1]) // 2
+    whole[top : top + inner[1], left : left + inner[0]] = cv2.resize(
+        picture, inner, interpolation=cv2.INTER_AREA
+    )
+    return whole
+
+
+def natural_key(name: str) -> list[tuple[bool, int, str]]:
+    """Return what to sort names by so that frame 9 comes before frame 10."""
+    parts = _DIGITS.split(name)
+    return [
+        (True, int(part), part) if index % 2 else (False, 0, part.lower()) for index, part in enumerate(parts)
+    ]

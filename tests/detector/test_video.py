@@ -1,0 +1,138 @@
+"""A clip's answers are the observer's, or those of a fixed step; names sort as people count; pictures fit a video."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from detector.camera_model import CameraModel
+from detector.flow import Tracks
+from detector.observer import CameraPose, Observation, VoidObserver
+from detector.params import DetectorParams
+from detector.pipeline import VoidDetector
+from detector.results import Diagnostics, NoDetection, NoDetectionReason, SinglePlane
+from detector.video import Answered, annotated, by_fixed_step, by_observer, fitted, natural_key
+
+OFFICE = Path(__file__).parents[1] / "data" / "pairs" / "office"
+PARAMS = DetectorParams.preset("default")
+KNOWN = json.loads((OFFICE / "poses.json").read_text())
+CAMERA = CameraModel(540, 360, KNOWN["K"][0][0], KNOWN["K"][1][1], KNOWN["K"][0][2], KNOWN["K"][1][2])
+
+
+def image(name):
+    return cv2.imread(str(OFFICE / name), cv2.IMREAD_GRAYSCALE)
+
+
+def pose(name):
+    matrix = np.array(KNOWN["poses"][name])
+    return CameraPose(matrix[:3, :3], matrix[:3, 3])
+
+
+def frames(*names):
+    return [(image(name), index * 100_000_000, pose(name)) for index, name in enumerate(names)]
+
+
+def same_answer(one, other):
+    assert type(one) is type(other)
+    for field in ("x_px", "y_px", "kind", "reason", "time_to_contact"):
+        assert getattr(one, field, None) == getattr(other, field, None)
+
+
+@pytest.mark.parametrize("with_poses", [True, False])
+def test_the_answers_are_the_observers_and_come_with_their_tracks(with_poses):
+    answer, observer = by_observer(PARAMS, CAMERA), VoidObserver(PARAMS, CAMERA)
+    for picture, time_ns, known in frames("00184.jpg", "00185.jpg"):
+        given_pose = known if with_poses else None
+        answered = answer(picture, time_ns, given_pose)
+        expected = observer.observe(picture, time_ns, given_pose)
+        same_answer(answered.observation.detection, expected.detection)
+        assert answered.observation.earlier_time_ns == expected.earlier_time_ns
+        assert answered.observation.baseline_m == expected.baseline_m
+        assert len(answered.tracks) == answered.observation.detection.diagnostics.n_after_distribution
+    assert len(answered.tracks) > 100
+
+
+def test_tracks_of_an_earlier_pair_are_not_shown_for_a_frame_without_one():
+    answer = by_observer(PARAMS, CAMERA)
+    for each in frames("00184.jpg", "00185.jpg"):
+        answered = answer(*each)
+    assert len(answered.tracks)
+    answered = answer(np.zeros((360, 540), np.uint8), 300_000_000, None)
+    assert answered.observation.detection.reason is NoDetectionReason.BLACK
+    assert len(answered.tracks) == 0
+
+
+def test_a_fixed_step_pairs_with_the_frame_so_many_before():
+    answer = by_fixed_step(PARAMS, CAMERA, 2)
+    clip = frames("00184.jpg", "00193.jpg", "00185.jpg", "00194.jpg")
+    answers = [answer(*each) for each in clip]
+    for early in answers[:2]:
+        assert early.observation.detection.reason is NoDetectionReason.NO_EARLIER_FRAME
+    for index, (a, b) in ((2, (clip[0], clip[2])), (3, (clip[1], clip[3]))):
+        observation = answers[index].observation
+        assert (observation.time_ns, observation.earlier_time_ns) == (b[1], a[1])
+        assert observation.baseline_m == pytest.approx(np.linalg.norm(b[2].position_m - a[2].position_m))
+    first = VoidDetector(PARAMS).detect(
+        clip[0][0],
+        clip[2][0],
+        camera=CAMERA,
+        later_from_earlier=clip[2][2].world_from_camera.T @ clip[0][2].world_from_camera,
+        translation_earlier=clip[0][2].world_from_camera.T @ (clip[2][2].position_m - clip[0][2].position_m),
+    )
+    same_answer(answers[2].observation.detection, first.detection)
+    np.testing.assert_array_equal(answers[2].tracks.end_px, first.tracks.end_px)
+
+
+def test_the_callers_image_may_change_after_the_call():
+    def play(spoil):
+        answer = by_fixed_step(PARAMS, None, 1)
+        for picture, time_ns, _ in frames("00184.jpg", "00185.jpg"):
+            answered = answer(picture, time_ns, None)
+            if spoil:
+                picture[:] = 0
+        return answered
+
+    same_answer(play(spoil=True).observation.detection, play(spoil=False).observation.detection)
+
+
+def test_a_step_below_one_is_refused():
+    with pytest.raises(ValueError, match="step"):
+        by_fixed_step(PARAMS, None, 0)
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=1, max_size=8))
+def test_numbers_in_names_sort_by_their_value(numbers):
+    names = [f"frame{number}.png" for number in numbers]
+    assert sorted(names, key=natural_key) == [f"frame{number}.png" for number in sorted(numbers)]
+
+
+def test_names_of_any_shape_can_be_sorted_together():
+    names = ["b2.png", "10.png", "9.png", "B1.png", "a.png", "\u00b23.png", ""]
+    assert sorted(names, key=natural_key)[:5] == ["", "9.png", "10.png", "a.png", "B1.png"]
+
+
+@pytest.mark.parametrize("size", [(48, 65), (361, 541), (360, 540)])
+def test_a_picture_has_even_sides_and_says_which_frame_it_is(size):
+    grey = np.full(size, 120, np.uint8)
+    nothing = NoDetection(NoDetectionReason.NO_MOTION, "", Diagnostics())
+    answered = Answered(Observation(nothing, 0), Tracks(np.zeros((0, 2)), np.zeros((0, 2))))
+    picture = annotated(grey, answered, 3, 0.3)
+    assert picture.shape[0] % 2 == picture.shape[1] % 2 == 0
+    assert picture.shape[1] >= 400
+    assert (annotated(grey, answered, 4, 0.3) != picture).any()
+    wall = Answered(Observation(SinglePlane(None, Diagnostics()), 0), answered.tracks)
+    assert (annotated(grey, wall, 3, 0.3) != picture).any()
+
+
+def test_a_picture_of_another_size_is_fitted_whole_and_in_proportion():
+    picture = np.full((100, 100, 3), 255, np.uint8)
+    assert fitted(picture, (100, 100)) is picture
+    wide = fitted(picture, (300, 50))
+    assert wide.shape == (50, 300, 3)
+    columns = np.nonzero(wide.any(axis=(0, 2)))[0]
+    assert (columns.min(), columns.max()) == (125, 174)
+    assert fitted(np.full((1, 500, 3), 255, np.uint8), (10, 10)).any()

@@ -18,6 +18,7 @@ DEEP_SHARE: Final = 0.9
 """Of the greatest depth: a column as deep as this is a right answer; a flat optimum has many."""
 WALL_LIMIT_M: Final = 3.0
 """Where the best free distance lies below it, a wall is ahead, if nothing else says whether one is."""
+_CHANCE_COLUMNS: Final = 180
 _MIN_FORWARD_M: Final = 0.01
 """With less motion along the axis there is no time to contact to compare with."""
 
@@ -71,6 +72,8 @@ class Verdict:
     right, in_box, error_width, error_deg, profile_ratio
         Of a direction: right by any rule; inside a box; its distance from the true point as a share of the width and as an angle;
         the depth of its column over that of the deepest one.
+    chance
+        Share of the columns that would be right, in the row where most of the truth lies: what guessing would reach.
     single_plane_truth, no_motion_truth
         What the scene is.
     foe_px
@@ -98,6 +101,7 @@ class Verdict:
     error_width: float | None
     error_deg: float | None
     profile_ratio: float | None
+    chance: float | None
     single_plane_truth: bool | None
     no_motion_truth: bool | None
     foe_px: float | None
@@ -174,11 +178,12 @@ def judge(answer: Answer, pair: Pair, scene: Scene, seconds: float) -> Verdict:
         y_px=None if point is None else point[1],
         width_px=scene.image_size_px[0],
         has_direction_truth=has_direction_truth(scene.truth),
-        right=None if point is None else _is_right(point, scene, ratio, in_box),
+        right=None if point is None else is_right(point, scene),
         in_box=in_box,
         error_width=error_width,
         error_deg=error_deg,
         profile_ratio=ratio,
+        chance=chance_right(scene),
         single_plane_truth=is_single_plane(scene.truth),
         no_motion_truth=scene.truth.no_motion,
         foe_px=_focus_error_px(answer, scene),
@@ -234,18 +239,32 @@ def profile_ratio(truth: Truth, x_px: float, width_px: int) -> float | None:
     return None if deepest_m is None or at_m is None else at_m / deepest_m
 
 
-# ---------------------------------------------------------------------- direction
-
-
-def _is_right(
-    point: tuple[float, float], scene: Scene, ratio: float | None, in_box: bool | None
-) -> bool | None:
+def is_right(point: tuple[float, float], scene: Scene) -> bool | None:
+    """Return whether a direction is right by any of the rules; None where the truth does not say."""
     truth = scene.truth
     if not has_direction_truth(truth):
         return None
     near = truth.vp is not None and math.dist(point, truth.vp) <= NEAR_SHARE * scene.image_size_px[0]
+    ratio = profile_ratio(truth, point[0], scene.image_size_px[0])
     deep = ratio is not None and ratio >= DEEP_SHARE  # a column whose depth is not known is not right
-    return near or deep or bool(in_box)
+    return near or deep or bool(_in_boxes(point, truth))
+
+
+def chance_right(scene: Scene) -> float | None:
+    """Return which share of the columns would be right, in the row of the vanishing point, of a box, or of the middle."""
+    truth, (width_px, height_px) = scene.truth, scene.image_size_px
+    boxes = _boxes(truth)
+    row_px = 0.5 * (height_px - 1)
+    if truth.vp is not None:
+        row_px = truth.vp[1]
+    elif boxes:
+        row_px = 0.5 * (boxes[0][1] + boxes[0][3])
+    columns = [(index + 0.5) / _CHANCE_COLUMNS * width_px - 0.5 for index in range(_CHANCE_COLUMNS)]
+    found = [is_right((x_px, row_px), scene) for x_px in columns]
+    return None if None in found else sum(map(bool, found)) / _CHANCE_COLUMNS
+
+
+# ---------------------------------------------------------------------- direction
 
 
 def _error(point: tuple[float, float], scene: Scene) -> tuple[float | None, float | None]:

@@ -262,6 +262,7 @@ def _direction(verdicts: Sequence[Verdict], seed: int) -> dict[str, Any]:
         "with_truth": len(judged),
         "right": sum(v.right is True for v in judged),
         "right_ci": _ci(judged, lambda v: v.right is True, seed),
+        "chance": _mean(v.chance for v in judged),
         "in_box": sum(v.in_box is True for v in judged),
         "within_tenth_width": sum(v.error_width is not None and v.error_width <= 0.1 for v in judged),
         "median_error_width": _median(v.error_width for v in judged),
@@ -334,6 +335,11 @@ def _ci(cases: Sequence[Verdict], is_hit: Callable[[Verdict], bool], seed: int) 
 def _median(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None and math.isfinite(value)]
     return float(np.median(known)) if known else None
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def _counts(names: Iterable[str]) -> dict[str, int]:

@@ -72,7 +72,7 @@ def comparison(result: Record, first: str, second: str) -> str:
 
 def _accuracy(summaries: Sequence[Record]) -> str:
     header = [
-        "set", "method", "preset", "told", "pairs", "directions right", "in box", "error (width)", "error (deg)",
+        "set", "method", "preset", "told", "pairs", "directions right", "by chance", "in box", "error (width)", "error (deg)",
         "profile ratio", "planes found", "false planes", "VP within W/10", "FOE (px)", "time to contact", "s median / p95",
     ]  # fmt: skip
     rows = []
@@ -88,6 +88,7 @@ def _accuracy(summaries: Sequence[Record]) -> str:
                 _told(item),
                 str(item["pairs"]),
                 _share(direction["right"], direction["with_truth"], direction["right_ci"]),
+                _percent(direction["chance"]),
                 str(direction["in_box"]) if boxed else _DASH,
                 _number(direction["median_error_width"]),
                 _number(direction["median_error_deg"]),
@@ -157,6 +158,10 @@ def _interval(interval: Sequence[float] | None, *, signed: bool = False) -> str:
 
 def _number(value: float | None) -> str:
     return _DASH if value is None else f"{value:.3g}"
+
+
+def _percent(value: float | None) -> str:
+    return _DASH if value is None else f"{100.0 * value:.0f} %"
 
 
 def _signed(value: float | None) -> str:

@@ -85,6 +85,14 @@ def test_any_rule_that_holds_is_enough_and_none_without_truth():
     assert not has_direction_truth(profile(None, None))
 
 
+def test_chance_is_the_share_of_columns_that_would_be_right():
+    assert verdict(Answer("none"), profile(1.0, 4.0, 3.9, None)).chance == pytest.approx(0.5)
+    assert verdict(at(5.0), Truth(vp=(200.0, 10.0))).chance == pytest.approx(0.2, abs=0.01)
+    assert verdict(at(5.0), Truth(vp=(0.0, 10.0))).chance == pytest.approx(0.1, abs=0.01)
+    assert verdict(at(5.0), Truth(far_box=(100, 180, 200, 190))).chance == pytest.approx(0.25, abs=0.01)
+    assert verdict(at(5.0), Truth(single_plane=True)).chance is None
+
+
 def test_other_answers_are_no_directions():
     for kind in ("single_plane", "none"):
         found = verdict(Answer(kind), profile(1.0, 2.0))

@@ -230,6 +230,17 @@ class LinkConfig(_Section):
     component_id: Annotated[
         int, Field(ge=1, le=255, description="Our own component id (191 MAV_COMP_ID_ONBOARD_COMPUTER).")
     ] = 191
+    planner_system_id: Annotated[
+        int,
+        Field(
+            ge=0,
+            le=255,
+            description="System id of the planner. Setpoints of others pass untouched and unprotected, announced. 0: any.",
+        ),
+    ] = 0
+    planner_component_id: Annotated[
+        int, Field(ge=0, le=255, description="Component id of the planner, likewise. 0: any.")
+    ] = 0
     signing: Annotated[
         Literal["forward"], Field(description="Signed setpoints: forward untouched, with an alarm.")
     ] = "forward"
@@ -256,6 +267,20 @@ class GuidanceConfig(_Section):
             gt=0,
             le=20,
             description="Longest horizontal step from the vehicle to a setpoint sent while protected (m). Larger: faster, longer to stop.",
+        ),
+    ] = 1.5
+    velocity: Annotated[
+        Literal["redirect", "hold", "forward"],
+        Field(
+            description="Setpoints of velocity alone. redirect: flown toward the void, vz and speed kept. hold: no horizontal motion, vz kept. forward: untouched and unprotected, announced."
+        ),
+    ] = "redirect"
+    velocity_horizon_s: Annotated[
+        float,
+        Field(
+            ge=0.5,
+            le=10,
+            description="How far a velocity reaches counts as its step: the speed is at most max_step_m, or the free distance less its margin, in this time (s). At least what the autopilot needs to stop by itself when setpoints end: PX4 1.2, ArduPilot 4.1 (GUID_TIMEOUT 3). Larger: slower.",
         ),
     ] = 1.5
     step_margin_m: Annotated[

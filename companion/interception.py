@@ -8,17 +8,36 @@ from typing import Any, Final
 from companion.config import Config
 from companion.frames.source import Frame
 from companion.guidance.coordinates import heading_rad, quaternion_from_euler
+from companion.guidance.dialect import Ambiguous, Autopilot, Motion, NotUnderstood, Reading, understand
+from companion.guidance.geodesy import GlobalReference
 from companion.guidance.observation import DetectionReport, Pose
 from companion.guidance.pose_buffer import PoseBuffer
-from companion.guidance.setpoint import Forward, LocalSetpoint, Rewrite, Verdict
+from companion.guidance.setpoint import (
+    Drop,
+    Forward,
+    LocalSetpoint,
+    Rewrite,
+    RewriteGlobal,
+    RewriteOffset,
+    RewriteVelocity,
+    Setpoint,
+    Unprotected,
+    Verdict,
+)
 from companion.guidance.substitution import GaveUp, State, StateChanged, Switch
+from companion.guidance.wish import express, wish_of
 from companion.log import Log
 from companion.mavlink.identity import Identity, MavSeverity, MavState
 from companion.mavlink.requests import EngageRequest
+from companion.mavlink.sources import Source
 from companion.mavlink.telemetry import (
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_PX4,
     Attitude,
     AttitudeQuaternion,
     ExtendedSysState,
+    GlobalOrigin,
+    GlobalPosition,
     Heartbeat,
     LocalPosition,
     Odometry,
@@ -30,6 +49,10 @@ from companion.mavlink.telemetry import (
 from companion.run_statistics import RunStatistics
 
 _HEARTBEAT_LOST_NS: Final = 3_500_000_000
+_AUTOPILOTS: Final = {
+    MAV_AUTOPILOT_PX4: Autopilot.PX4,
+    MAV_AUTOPILOT_ARDUPILOTMEGA: Autopilot.ARDUPILOT,
+}
 _REQUEST_COUNTS_NS: Final = 1_500_000_000
 """By then a HEARTBEAT (1 Hz) has said whether a request was carried out."""
 
@@ -61,6 +84,7 @@ class Interception:
         self._identity = identity
         self._log = log
         self._poses = PoseBuffer(jump_m=guidance.estimator_jump_m)
+        self._reference = GlobalReference()
         self._announced_unprotected: set[str] = set()
         self._unusable: set[tuple[int, str]] = set()
         self._reset_counter: int | None = None
@@ -76,9 +100,19 @@ class Interception:
 
     # ------------------------------------------------------------------ from the proxy
 
-    def on_setpoint(self, setpoint: LocalSetpoint, system_id: int, component_id: int, now_ns: int) -> Verdict:
-        """Return what is sent in place of a planner's position setpoint."""
-        verdict = self.switch.on_setpoint(setpoint, now_ns)
+    def on_setpoint(self, setpoint: Setpoint, system_id: int, component_id: int, now_ns: int) -> Verdict:
+        """Return what is sent in place of a planner's setpoint of position or velocity."""
+        if not self._is_planner(system_id, component_id):
+            return Unprotected(f"from {system_id}/{component_id}, not the planner")
+        reading = understand(setpoint, self._autopilot())
+        match reading:
+            case NotUnderstood():
+                return Unprotected(reading.reason)
+            case Ambiguous():
+                return Drop("autopilot not known")
+            case Reading(motion=Motion.VELOCITY) if self._config.guidance.velocity == "forward":
+                return Unprotected("velocity only")
+        verdict = self._decide(setpoint, reading, now_ns)
         self.statistics.setpoints.tick(now_ns)
         self.announce()
         if self._report_waiting is not None and self.switch.state is not State.DISENGAGED:
@@ -94,6 +128,39 @@ class Interception:
                 **self._last_verdict,
             )
         return verdict
+
+    def _decide(self, setpoint: Setpoint, reading: Reading, now_ns: int) -> Verdict:
+        """Ask the switch S in local NED, and say its answer in the setpoint's own kind."""
+        anchor, autopilot, guidance = self._reference.anchor, self._autopilot(), self._config.guidance
+        wish = wish_of(
+            setpoint, reading, pose=self.switch.pose, anchor=anchor, autopilot=autopilot, config=guidance
+        )
+        decision = self.switch.on_setpoint(wish, now_ns)
+        return express(
+            decision,
+            setpoint,
+            reading,
+            pose=self.switch.pose if self.switch.pose_is_fresh(now_ns) else None,
+            anchor=anchor,
+            autopilot=autopilot,
+            config=guidance,
+        )
+
+    def _is_planner(self, system_id: int, component_id: int) -> bool:
+        link = self._config.link
+        return link.planner_system_id in (0, system_id) and link.planner_component_id in (0, component_id)
+
+    def _autopilot(self) -> Autopilot:
+        vehicle = self._identity.vehicle
+        if vehicle is None:
+            return Autopilot.UNKNOWN
+        return _AUTOPILOTS.get(vehicle.autopilot, Autopilot.OTHER)
+
+    def on_rivals(self, sources: tuple[Source, ...], now_ns: int) -> None:
+        """Announce that several senders fight over the vehicle: the autopilot takes from each in turn."""
+        names = [f"{system_id}/{component_id}" for system_id, component_id in sources]
+        self._log.warning("rival_setpoints", sources=names, time_ns=now_ns)
+        self._identity.status_text(MavSeverity.WARNING, f"void: setpoints from {' and '.join(names)}")
 
     def on_unprotected(self, kind: str, detail: str) -> None:
         """Announce, once for each kind, that a setpoint passes through as it came."""
@@ -127,7 +194,12 @@ class Interception:
                 )
                 if reset:
                     self._on_estimator_reset(now_ns, "position jump")
+                self._reference.on_local(message.time_boot_ms, message.x, message.y, message.vx, message.vy)
                 self._tell_pose()
+            case GlobalPosition():
+                self._reference.on_global(message.time_boot_ms, message.lat_int, message.lon_int)
+            case GlobalOrigin():
+                self._reference.on_origin(message.lat_int, message.lon_int)
             case Attitude():
                 q = quaternion_from_euler(message.roll, message.pitch, message.yaw)
                 rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
@@ -169,6 +241,7 @@ class Interception:
 
     def _on_estimator_reset(self, now_ns: int, why: str) -> None:
         self._log.warning("estimator_reset", why=why)
+        self._reference.forget()
         self.switch.on_estimator_reset(now_ns, why)
         self.announce()
 
@@ -272,20 +345,37 @@ def _severity(event: StateChanged) -> MavSeverity:
     return MavSeverity.WARNING if event.state is State.HOLD else MavSeverity.INFO
 
 
-def _verdict_fields(setpoint: LocalSetpoint, verdict: Verdict) -> dict[str, Any]:
-    fields: dict[str, Any] = {"planned": [round(v, 3) for v in (setpoint.x, setpoint.y, setpoint.z)]}
+def _verdict_fields(setpoint: Setpoint, verdict: Verdict) -> dict[str, Any]:
+    """Return what was asked for and what is sent, for the log and the status line."""
+    planned = _planned(setpoint)
+    fields: dict[str, Any] = {"planned": planned}
     match verdict:
-        case Rewrite():
+        case Rewrite() | RewriteOffset():
             fields["action"] = verdict.action
-            fields["sent"] = [round(verdict.x, 3), round(verdict.y, 3), round(setpoint.z, 3)]
-            fields["yaw_deg"] = None if verdict.yaw is None else round(math.degrees(verdict.yaw), 1)
+            z = verdict.z if isinstance(verdict, RewriteOffset) and verdict.z is not None else planned[2]
+            fields["sent"] = [round(verdict.x, 3), round(verdict.y, 3), round(z, 3)]
+        case RewriteVelocity():
+            fields["action"] = verdict.action
+            fields["planned"] = [round(v, 3) for v in (setpoint.vx, setpoint.vy, setpoint.vz)]
+            fields["sent"] = [round(verdict.vx, 3), round(verdict.vy, 3), round(setpoint.vz, 3)]
+        case RewriteGlobal():
+            fields["action"] = verdict.action
+            fields["sent"] = [verdict.lat_int, verdict.lon_int, planned[2]]
         case Forward():
             fields["action"] = "forwarded"
-            fields["sent"] = fields["planned"]
-        case _:
+            fields["sent"] = planned
+        case Drop():
             fields["action"] = "dropped"
             fields["dropped"] = verdict.reason
+    if isinstance(verdict, Rewrite | RewriteOffset | RewriteVelocity | RewriteGlobal):
+        fields["yaw_deg"] = None if verdict.yaw is None else round(math.degrees(verdict.yaw), 1)
     return fields
+
+
+def _planned(setpoint: Setpoint) -> list[float]:
+    if isinstance(setpoint, LocalSetpoint):
+        return [round(v, 3) for v in (setpoint.x, setpoint.y, setpoint.z)]
+    return [setpoint.lat_int, setpoint.lon_int, round(setpoint.alt, 3)]
 
 
 def _report_fields(report: DetectionReport, now_ns: int) -> dict[str, Any]:

@@ -8,9 +8,10 @@ from companion.config import GuidanceConfig
 from companion.guidance.coordinates import heading_rad, wrap_rad
 from companion.guidance.observation import Pose
 from companion.guidance.plan import Plan
-from companion.guidance.setpoint import Forward, LocalSetpoint, Rewrite, TypeMask, Verdict
+from companion.guidance.setpoint import Decision, Forward, Rewrite
 from companion.guidance.situation import Evidence, Situation, remaining_m
 from companion.guidance.table import LOOK_AGAIN, State, Table
+from companion.guidance.wish import Wish
 
 _COMMAND_RECENT_NS = 500_000_000
 _MAX_SLEW_DT_S = 0.2
@@ -58,7 +59,7 @@ class YawSlew:
 
 
 class Command:
-    """Turns the state into a verdict for one setpoint.
+    """Turns the state into a decision on one setpoint.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ class Command:
         self._camera_yaw_rad = camera_yaw_rad
         self.yaw = YawSlew(config)
 
-    def act(self, state: State, s: Situation) -> Verdict:
+    def act(self, state: State, s: Situation) -> Decision:
         """Return what is sent in a state (any but DISENGAGED)."""
         plan = self._plan
         if state is State.FOLLOW:
@@ -94,59 +95,63 @@ class Command:
         if state is State.STEER and s.answer is not None:
             return self._steer(s, s.answer.azimuth_rad, self._evidence.void_free_m(s.answer, s))
         if state is State.PROBE:
-            return self._rewrite(*plan.probe_target, plan.probe_yaw_rad, "substituted", s)
+            here_m = plan.probe_down_m
+            return self._rewrite(*plan.probe_target, plan.probe_yaw_rad, "substituted", s, down_m=here_m)
         if plan.anchor is None:
             plan.set_anchor(s.pose)
         x, y = plan.anchor or (s.pose.north_m, s.pose.east_m)
+        down_m = plan.anchor_down_m
         if state is State.ALIGN:
-            return self._rewrite(x, y, s.bearing_rad - self._camera_yaw_rad, "turned", s)
+            return self._rewrite(x, y, s.bearing_rad - self._camera_yaw_rad, "turned", s, down_m=down_m)
         if state is State.TURN:
             plan.anchor_yaw_rad = wrap_rad(plan.turn_target_rad - self._camera_yaw_rad)
-            return self._rewrite(x, y, plan.anchor_yaw_rad, "turned", s)
-        return self._rewrite(x, y, plan.anchor_yaw_rad, "held", s)
+            return self._rewrite(x, y, plan.anchor_yaw_rad, "turned", s, down_m=down_m)
+        return self._rewrite(x, y, plan.anchor_yaw_rad, "held", s, down_m=down_m)
 
-    def hold_blindly(self, now_ns: int) -> Verdict | None:
+    def hold_blindly(self, now_ns: int) -> Decision | None:
         """Return a hold at the anchor, whatever the pose is now; None without an anchor."""
         if self._plan.anchor is None:
             return None
         self.yaw.commanded(self._plan.anchor_yaw_rad, now_ns)
-        return Rewrite(*self._plan.anchor, self._plan.anchor_yaw_rad, "held")
+        return Rewrite(*self._plan.anchor, self._plan.anchor_yaw_rad, "held", self._plan.anchor_down_m)
 
-    def _steer(self, s: Situation, psi: float, free_m: float | None) -> Verdict:
+    def _steer(self, s: Situation, psi: float, free_m: float | None) -> Decision:
         step_m = self._step_m(s.goal_m, free_m)
         out_of_sight = abs(wrap_rad(psi - s.look_rad)) > math.radians(self._config.align_deg)
         if out_of_sight or self._table.choose(s)[1] == LOOK_AGAIN:
             # The camera must look where it flies, and no way is open before it is seen again.
             step_m = 0.0
         x, y = s.pose.north_m + step_m * math.cos(psi), s.pose.east_m + step_m * math.sin(psi)
-        return self._rewrite(x, y, psi - self._camera_yaw_rad, "substituted", s)
+        down_m = None if step_m > 0.0 else s.pose.down_m
+        return self._rewrite(x, y, psi - self._camera_yaw_rad, "substituted", s, down_m=down_m)
 
-    def _follow(self, s: Situation) -> Verdict:
-        sp = s.setpoint
-        yaw_used = not sp.type_mask & TypeMask.YAW_IGNORE
+    def _follow(self, s: Situation) -> Decision:
+        wish = s.wish
         wanted_yaw: float | None
         if s.reached:
-            step_m, wanted_yaw = min(s.goal_m, self._config.max_step_m), (sp.yaw if yaw_used else None)
+            step_m, wanted_yaw = min(s.goal_m, self._config.max_step_m), wish.yaw_rad
         else:
             step_m = self._step_m(s.goal_m, self._free_to_goal_m(s))
             if self._table.choose(s)[1] == LOOK_AGAIN:
                 step_m = 0.0
             wanted_yaw = s.bearing_rad - self._camera_yaw_rad
-            if yaw_used and abs(wrap_rad(sp.yaw + self._camera_yaw_rad - s.bearing_rad)) <= math.radians(
-                self._config.view_deg
-            ):
-                wanted_yaw = sp.yaw
+            if wish.yaw_rad is not None:
+                off_bearing = wrap_rad(wish.yaw_rad + self._camera_yaw_rad - s.bearing_rad)
+                if abs(off_bearing) <= math.radians(self._config.view_deg):
+                    wanted_yaw = wish.yaw_rad
         whole_step = step_m >= s.goal_m
         slewed = None if wanted_yaw is None else self.yaw.toward(wanted_yaw, s.pose, s.now_ns)
         if whole_step and self._may_pass(s, slewed):
-            self.yaw.commanded(sp.yaw if yaw_used else heading_rad(s.pose.q_ned_from_body), s.now_ns)
+            passes = heading_rad(s.pose.q_ned_from_body) if wish.yaw_rad is None else wish.yaw_rad
+            self.yaw.commanded(passes, s.now_ns)
             return Forward()
         if whole_step:
-            x, y = sp.x, sp.y
+            x, y = s.goal
         else:
             x = s.pose.north_m + step_m * math.cos(s.bearing_rad)
             y = s.pose.east_m + step_m * math.sin(s.bearing_rad)
-        return self._rewrite(x, y, wanted_yaw, "substituted", s, slewed=slewed)
+        down_m = None if s.reached or step_m > 0.0 else s.pose.down_m
+        return self._rewrite(x, y, wanted_yaw, "substituted", s, down_m=down_m, slewed=slewed)
 
     def _free_to_goal_m(self, s: Situation) -> float | None:
         """Return the free distance toward the goal, where anything is known of it."""
@@ -160,20 +165,17 @@ class Command:
 
     def _may_pass(self, s: Situation, slewed: float | None) -> bool:
         """Whether a setpoint whose whole step is granted may pass byte for byte, its yaw and further terms included."""
-        sp = s.setpoint
-        yaw_used = not sp.type_mask & TypeMask.YAW_IGNORE
-        if s.reached and not yaw_used:  # hover, with or without a slow yaw rate
-            return self._is_calm(sp)
-        further_terms = any(field.startswith(("v", "af", "yaw_rate")) for field in sp.used_fields())
-        yaw_is_granted = slewed is not None and abs(wrap_rad(slewed - sp.yaw)) < 1e-6
-        return yaw_used and yaw_is_granted and not further_terms
-
-    def _is_calm(self, sp: LocalSetpoint) -> bool:
-        """Whether the further terms of a setpoint at the goal cannot carry the vehicle away."""
-        used = sp.used_fields()
-        if any(field.startswith(("v", "af")) for field in used):
+        wish = s.wish
+        if s.reached and wish.yaw_rad is None:  # hover, with or without a slow yaw rate
+            return self._is_calm(wish)
+        if wish.yaw_rad is None or slewed is None or wish.carries or wish.yaw_rate_rad_s is not None:
             return False
-        return abs(used.get("yaw_rate", 0.0)) <= math.radians(self._config.yaw_rate_deg_s)
+        return abs(wrap_rad(slewed - wish.yaw_rad)) < 1e-6
+
+    def _is_calm(self, wish: Wish) -> bool:
+        """Whether the further terms of a setpoint at the goal cannot carry the vehicle away, nor spin it."""
+        rate_rad_s = 0.0 if wish.yaw_rate_rad_s is None else wish.yaw_rate_rad_s
+        return not wish.carries and abs(rate_rad_s) <= math.radians(self._config.yaw_rate_deg_s)
 
     def _step_m(self, goal_m: float, free_m: float | None) -> float:
         step_m = min(goal_m, self._config.max_step_m)
@@ -189,10 +191,11 @@ class Command:
         action: str,
         s: Situation,
         *,
+        down_m: float | None,
         slewed: float | None = None,
     ) -> Rewrite:
         if yaw_rad is None:
-            return Rewrite(x, y, None, action)
+            return Rewrite(x, y, None, action, down_m)
         yaw = self.yaw.toward(yaw_rad, s.pose, s.now_ns) if slewed is None else slewed
         self.yaw.commanded(yaw, s.now_ns)
-        return Rewrite(x, y, yaw, action)
+        return Rewrite(x, y, yaw, action, down_m)

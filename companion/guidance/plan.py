@@ -13,6 +13,8 @@ from companion.guidance.situation import Evidence
 TURN_DONE_RAD = math.radians(5.0)
 """A turn that is this close to its end is done."""
 _DEAD_AHEAD_RAD = math.radians(5.0)
+_ALIGN_SPARE_RAD = math.radians(30.0)
+_SAME_DIRECTION_RAD = math.radians(15.0)
 
 Place = tuple[float, float]
 """North and east in local NED, m."""
@@ -34,17 +36,23 @@ class Plan:
         self._evidence = evidence
         self.episode: Episode | None = None
         self.anchor: Place | None = None
+        self.anchor_down_m = 0.0
         self.anchor_yaw_rad = 0.0
+        self.turns_along_rad: float | None = None
+        self._align_look_rad = 0.0
+        self._align_rest_rad = 0.0
         self.steer_start: Place = (0.0, 0.0)
         self.turn_target_rad = 0.0
         self.probed = ""
         self.probe_target: Place = (0.0, 0.0)
         self.probe_yaw_rad = 0.0
+        self.probe_down_m = 0.0
 
     def forget(self) -> None:
         """Forget episode and anchor: the mode was left, or the local frame is another one."""
         self.episode = None
         self.anchor = None
+        self.turns_along_rad = None
 
     def end_episode_left_behind(self, pose: Pose) -> None:
         """End the episode where the vehicle has left its place."""
@@ -54,6 +62,7 @@ class Plan:
     def set_anchor(self, pose: Pose) -> None:
         """Hold here, at the present heading."""
         self.anchor = (pose.north_m, pose.east_m)
+        self.anchor_down_m = pose.down_m
         self.anchor_yaw_rad = heading_rad(pose.q_ned_from_body)
 
     def begin_or_keep_episode(self, pose: Pose) -> Episode:
@@ -65,6 +74,23 @@ class Plan:
         if bearing is not None:
             episode.block(bearing, pose)
         return episode
+
+    def begin_align(self, look_rad: float, off_axis_rad: float) -> None:
+        """Take note of how far there is to turn until the goal is in view."""
+        self._align_look_rad = look_rad
+        self._align_rest_rad = off_axis_rad + _ALIGN_SPARE_RAD
+
+    def aligned_in_vain(self, look_rad: float) -> bool:
+        """Take the camera's azimuth while aligning; return whether a goal that stands still would be in view by now."""
+        self._align_rest_rad -= abs(wrap_rad(look_rad - self._align_look_rad))
+        self._align_look_rad = look_rad
+        return self._align_rest_rad <= 0.0
+
+    def turns_along(self, body_bearing_rad: float | None) -> bool:
+        """Whether a goal in this direction from the nose was found to turn with the vehicle."""
+        if self.turns_along_rad is None or body_bearing_rad is None:
+            return False
+        return abs(wrap_rad(body_bearing_rad - self.turns_along_rad)) <= _SAME_DIRECTION_RAD
 
     def begin_turn(self, pose: Pose) -> None:
         """Choose the side, once for an episode, and where the next step of the turn ends."""
@@ -86,6 +112,7 @@ class Plan:
         look = self._evidence.look_rad(pose)
         choice = self.probe_choice(pose, look, now_ns)
         self.probe_yaw_rad = heading_rad(pose.q_ned_from_body)
+        self.probe_down_m = pose.down_m
         self._evidence.take_answers_after(now_ns)
         if choice is None:
             self.probed = ""

@@ -16,7 +16,7 @@ from companion.guidance.freshness import expiry
 from companion.guidance.goal import Goal
 from companion.guidance.memory import SeenBearings, Track
 from companion.guidance.observation import DetectionReport, Pose
-from companion.guidance.setpoint import LocalSetpoint
+from companion.guidance.wish import Wish
 
 _NO_PARALLAX = ("no_motion", "no_earlier_frame")
 """Reasons of the detector that say nothing about the scene: the last answer stays and ages."""
@@ -57,14 +57,18 @@ class Situation:
     ----------
     now_ns
         Our monotonic time.
-    setpoint
+    wish
         What the planner asks for.
     pose, speed_m_s
         The vehicle's.
     look_rad
         Azimuth of the camera's axis.
+    goal
+        The planner's: north and east, m.
     bearing_rad, goal_m
-        Azimuth and horizontal distance from the vehicle to the planner's goal.
+        Azimuth and horizontal distance from the vehicle to it.
+    wants_to_move
+        The planner wants to get somewhere.
     reached
         The goal has been stationary for a while and is near, with nothing nearer.
     off_axis_rad
@@ -78,12 +82,14 @@ class Situation:
     """
 
     now_ns: int
-    setpoint: LocalSetpoint
+    wish: Wish
     pose: Pose
     speed_m_s: float
     look_rad: float
+    goal: tuple[float, float]
     bearing_rad: float
     goal_m: float
+    wants_to_move: bool
     reached: bool
     off_axis_rad: float
     answer: Answer | None
@@ -208,10 +214,10 @@ class Evidence:
         last = self.last_report
         return last is not None and last.kind == "none" and last.reason not in _NO_PARALLAX
 
-    def situation(self, setpoint: LocalSetpoint, pose: Pose, now_ns: int) -> Situation:
-        """Return what is true now for one setpoint of the planner."""
+    def situation(self, wish: Wish, goal: tuple[float, float], pose: Pose, now_ns: int) -> Situation:
+        """Return what is true now for one setpoint of the planner, whose goal is known."""
         config = self._config
-        to_north, to_east = setpoint.x - pose.north_m, setpoint.y - pose.east_m
+        to_north, to_east = goal[0] - pose.north_m, goal[1] - pose.east_m
         goal_m = math.hypot(to_north, to_east)
         look = self.look_rad(pose)
         bearing = math.atan2(to_east, to_north) if goal_m > 1e-6 else look
@@ -220,17 +226,21 @@ class Evidence:
         free_bearing_m = self.free_m(bearing, pose, now_ns)
         radius_m = config.arrive_radius_m * (_ARRIVED_FACTOR if self._arrived else 1.0)
         nothing_nearer = wall is None and (free_bearing_m is None or free_bearing_m >= goal_m)
-        settled = self.goal.still_s(now_ns) >= config.goal_settle_s
-        reached = goal_m <= radius_m and settled and nothing_nearer
+        settled = goal_m <= radius_m and self.goal.still_s(now_ns) >= config.goal_settle_s
+        # A goal that moves with the vehicle is never arrived at: it is only ever to stay, or to go on.
+        arrived = wish.asks_to_stay(goal_m) if wish.is_relative else settled
+        reached = arrived and nothing_nearer
         self._arrived = reached
         return Situation(
             now_ns=now_ns,
-            setpoint=setpoint,
+            wish=wish,
             pose=pose,
             speed_m_s=self.speed_m_s,
             look_rad=look,
+            goal=goal,
             bearing_rad=bearing,
             goal_m=goal_m,
+            wants_to_move=wish.wants_to_move(goal_m, config.arrive_radius_m),
             reached=reached,
             off_axis_rad=abs(wrap_rad(bearing - look)),
             answer=answer,

@@ -7,12 +7,13 @@ module             holds
 ``table``          what each state does next (the table of states stands at the top of it)
 ``plan``           what the present state set out to do: anchor, turn, probe, episode
 ``command``        what is sent in each state, within the caps on step and yaw rate
-this one           the machine: events in, verdicts and events out
+this one           the machine: events in, decisions and events out
 =================  ====================================================================================
 
 In every state z is the planner's, and nothing is sent while the planner is silent: the autopilot's own
 failsafe acts then. Everything that comes in is a value with the time when it was true; everything that goes
-out is a :class:`~companion.guidance.setpoint.Verdict` for one setpoint, and events for the log.
+out is a :data:`~companion.guidance.setpoint.Decision` on one setpoint, in local NED, and events for the log.
+``dialect`` and ``wish`` translate between the kinds of setpoints and local NED.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ from companion.guidance.command import Command
 from companion.guidance.coordinates import heading_rad
 from companion.guidance.observation import DetectionReport, Pose
 from companion.guidance.plan import Plan
-from companion.guidance.setpoint import Drop, Forward, LocalSetpoint, Verdict
-from companion.guidance.situation import Evidence
+from companion.guidance.setpoint import Decision, Drop, Forward, Stay
+from companion.guidance.situation import Evidence, Situation
 from companion.guidance.table import HELD_STATES, NO_WAY_OUT, Standing, State, Table
+from companion.guidance.wish import Wish
 
 __all__ = ["Event", "GaveUp", "State", "StateChanged", "Switch"]
 
@@ -59,7 +61,7 @@ Event = StateChanged | GaveUp
 
 
 class Switch:
-    """The switch S as a state machine: events in, verdicts and events out.
+    """The switch S as a state machine: events in, decisions and events out.
 
     Parameters
     ----------
@@ -101,6 +103,16 @@ class Switch:
         """Why it is in that state."""
         return self._standing.reason
 
+    @property
+    def pose(self) -> Pose | None:
+        """The vehicle's newest pose in the present local frame, however old; None where none is known."""
+        return self._evidence.pose
+
+    def pose_is_fresh(self, now_ns: int) -> bool:
+        """Whether that pose may be measured from."""
+        pose = self._evidence.pose
+        return pose is not None and now_ns - pose.time_ns <= self._config.pose_max_age_s * 1e9
+
     def drain_events(self) -> list[Event]:
         """Return the events since the last call, oldest first."""
         events, self._events = self._events, []
@@ -113,7 +125,7 @@ class Switch:
         evidence = self._evidence
         if evidence.pose is None:
             return "no pose from the autopilot"
-        if now_ns - evidence.pose.time_ns > self._config.pose_max_age_s * 1e9:
+        if not self.pose_is_fresh(now_ns):
             return "pose too old"
         if evidence.last_report_ns is None:
             return "no detection report yet"
@@ -164,39 +176,42 @@ class Switch:
         """Take one report of the vision worker; one about an older frame than the last is ignored."""
         self._evidence.on_report(report, now_ns)
 
-    def on_setpoint(self, setpoint: LocalSetpoint, now_ns: int) -> Verdict:
-        """Decide what is sent in place of one position setpoint of the planner.
+    def on_setpoint(self, wish: Wish, now_ns: int) -> Decision:
+        """Decide what is sent in place of one setpoint of the planner.
 
         Parameters
         ----------
-        setpoint
-            A position setpoint in LOCAL_NED (x, y, z used).
+        wish
+            What it asks for.
         now_ns
             Our monotonic time.
 
         Returns
         -------
-        Forward, Rewrite or Drop
+        Forward, Rewrite, Stay or Drop
             Drop only where nothing safe can be said: no pose was ever known.
         """
-        if setpoint.nonfinite_used_fields():
+        if wish.goal is not None and not all(map(math.isfinite, wish.goal)):
             return Drop("not finite")
-        self._note_goal(setpoint, now_ns)
+        self._note_goal(wish, now_ns)
         if self._engaged is False:
             return Forward()
         fault = self.not_ready(now_ns) if self._engaged else "no heartbeat from the autopilot"
-        if fault is not None:
-            return self._without_protection(setpoint, fault, now_ns)
-        pose = self._evidence.pose
-        if pose is None:  # not_ready() has said so
-            return Drop("no pose")
-        situation = self._evidence.situation(setpoint, pose, now_ns)
+        pose, goal = self._evidence.pose, wish.goal
+        if fault is not None or pose is None or goal is None:
+            return self._without_protection(wish, fault or wish.unknown, now_ns)
+        situation = self._evidence.situation(wish, goal, pose, now_ns)
         if self._gave_up_on_fault:  # the fault has cleared: what was given up is possible again
             self._standing.gave_up = self._gave_up_on_fault = False
             self._progress = None
-        self._watch_progress(pose, setpoint, self.reason, now_ns)
+        self._watch_progress(pose, wish, self.reason, now_ns)
+        if wish.refused:
+            if not self._standing.gave_up:
+                self._enter(State.HOLD, wish.refused, now_ns)
+            return self._command.act(State.HOLD, situation)
         if self.state is State.DISENGAGED:
             self._enter(*self._table.choose(situation), now_ns)
+            self._begin_align(situation)
         # A change may make the next one due at once (TURN when 360 deg are swept, PROBE with nothing to
         # probe); each state is left at most once a setpoint, so this ends.
         for _ in State:
@@ -204,7 +219,8 @@ class Switch:
             if change is None or change == (self.state, self.reason):
                 break
             self._enter(*change, now_ns)
-            situation = self._evidence.situation(setpoint, pose, now_ns)
+            situation = self._evidence.situation(wish, goal, pose, now_ns)
+            self._begin_align(situation)
         return self._command.act(self.state, situation)
 
     # ------------------------------------------------------------------ the machine
@@ -239,7 +255,11 @@ class Switch:
         if state is State.PROBE:
             plan.begin_probe(pose, now_ns)
 
-    def _without_protection(self, setpoint: LocalSetpoint, fault: str, now_ns: int) -> Verdict:
+    def _begin_align(self, s: Situation) -> None:
+        if self.state is State.ALIGN and self._standing.entered_ns == s.now_ns:
+            self._plan.begin_align(s.look_rad, s.off_axis_rad)
+
+    def _without_protection(self, wish: Wish, fault: str, now_ns: int) -> Decision:
         """Hold, or pass where the user allowed it: an input is missing or too old."""
         if self._config.allow_unprotected and self.state is State.DISENGAGED:
             reason = f"unprotected: {fault}"
@@ -251,13 +271,14 @@ class Switch:
         pose = self._evidence.pose
         if self._plan.anchor is None and pose is not None:
             self._plan.set_anchor(pose)
+        nothing = Stay("held") if wish.is_relative else Drop(f"no pose to hold: {fault}")
         if pose is None:
-            return Drop(f"no pose to hold: {fault}")
-        self._watch_progress(pose, setpoint, fault, now_ns)
-        return self._command.hold_blindly(now_ns) or Drop(f"no pose to hold: {fault}")
+            return nothing
+        self._watch_progress(pose, wish, fault, now_ns)
+        return self._command.hold_blindly(now_ns) or nothing
 
-    def _note_goal(self, setpoint: LocalSetpoint, now_ns: int) -> None:
-        if self._evidence.goal.note((setpoint.x, setpoint.y), now_ns):
+    def _note_goal(self, wish: Wish, now_ns: int) -> None:
+        if wish.goal is not None and self._evidence.goal.note(wish.goal, now_ns):
             self._plan.episode = None
             self._standing.gave_up = False
             self._progress = None
@@ -267,10 +288,10 @@ class Switch:
         if pose is not None:
             self._plan.end_episode_left_behind(pose)
 
-    def _watch_progress(self, pose: Pose, setpoint: LocalSetpoint, why: str, now_ns: int) -> None:
+    def _watch_progress(self, pose: Pose, wish: Wish, why: str, now_ns: int) -> None:
         """Give up, once, where the vehicle has got nowhere for ``give_up_s`` although the planner wants to."""
         here = (pose.north_m, pose.east_m)
-        wants_to_move = math.dist(here, (setpoint.x, setpoint.y)) > self._config.arrive_radius_m
+        wants_to_move = wish.wants_to_move(wish.goal_m(pose), self._config.arrive_radius_m)
         if not wants_to_move or self._progress is None or math.dist(self._progress, here) > _PROGRESS_M:
             self._progress, self._progress_ns = here, now_ns
             self._standing.gave_up = self._gave_up_on_fault = False

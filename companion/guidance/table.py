@@ -1,6 +1,7 @@
 """The table of the switch S: what each state does next.
 
-It looks at a situation and at the plan, and changes neither, but for the sweep of a turn that is done.
+It looks at a situation and at the plan. Of the plan it changes what turns add up to: the sweep of a turn that is
+done, and how far an alignment has come.
 
 =============  =====================================================  ==========================================
 state          sent in place of the planner's setpoint                goes to
@@ -35,6 +36,8 @@ from companion.guidance.situation import Evidence, Situation
 LOOK_AGAIN = "way blocked, looking again"
 """One answer says that no way is open: no step is made, and the vote of the next answers decides."""
 NO_WAY_OUT = "no way out"
+TURNS_ALONG = "the goal turns with the vehicle"
+"""A direction in the body frame that is out of view: turning toward it does not bring it into view."""
 _MEASURED_FREE_FACTOR = 0.7
 """In FOLLOW this share of a step measured free is enough to stay: the step is shortened to it anyway."""
 _REASON_KEPT_NS = 2_000_000_000
@@ -126,9 +129,9 @@ class Table:
         if s.answer is None:
             if in_view or blocked_before:
                 return State.HOLD, s.no_answer
-            return State.ALIGN, "goal out of view"
+            return self._look_there(s)
         if not in_view and not blocked_before:
-            return State.ALIGN, "goal out of view"
+            return self._look_there(s)
         evidence = self._evidence
         if in_view and evidence.is_open(s.free_bearing_m, s.goal_m):
             if self._is_measured_free(s):
@@ -139,6 +142,11 @@ class Table:
         if void_is_open and not (in_view and self._agrees(s)):
             return State.STEER, "void elsewhere"
         return State.HOLD, LOOK_AGAIN
+
+    def _look_there(self, s: Situation) -> Change:
+        if self._plan.turns_along(s.wish.body_bearing_rad):
+            return State.HOLD, TURNS_ALONG
+        return State.ALIGN, "goal out of view"
 
     def _agrees(self, s: Situation) -> bool:
         """Whether the void lies at the goal's bearing, or a plane that fills the view is far enough."""
@@ -173,6 +181,10 @@ class Table:
             return State.FOLLOW, "at the goal"
         if s.off_axis_rad <= 0.6 * math.radians(self._config.view_deg):
             return self.choose(s)
+        in_vain = self._plan.aligned_in_vain(s.look_rad)
+        if in_vain and s.wish.body_bearing_rad is not None:
+            self._plan.turns_along_rad = s.wish.body_bearing_rad
+            return State.HOLD, TURNS_ALONG
         turn_s = math.pi / math.radians(self._config.yaw_rate_deg_s)
         if self._standing.for_s(s.now_ns) > 2 * turn_s + 3:
             return State.HOLD, "the vehicle does not turn"
@@ -239,8 +251,11 @@ class Table:
         state, reason = self.choose(s)
         if state is not State.HOLD:
             return state, reason
-        wants_to_move = s.goal_m > self._config.arrive_radius_m
-        if wants_to_move and standing.for_s(s.now_ns) >= self._config.hold_probe_s:
+        if (
+            s.wants_to_move
+            and reason != TURNS_ALONG
+            and standing.for_s(s.now_ns) >= self._config.hold_probe_s
+        ):
             probe = self._plan.probe_choice(s.pose, s.look_rad, s.now_ns)
             if not self._evidence.says_no_texture() and probe is not None:
                 return State.PROBE, "no parallax"

@@ -1,10 +1,11 @@
-"""SET_POSITION_TARGET_LOCAL_NED on the wire: read it, and change it in place.
+"""SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT on the wire: read them, and change them in place.
 
 A rewritten frame keeps everything that says whose it is and when it was sent: seq, sysid, compid,
-time_boot_ms, target and coordinate frame. The four bytes of z are never written: there is no way to change the
-altitude from here.
+time_boot_ms, target and coordinate frame. The four bytes of z, and of vz where it stands for z, are not written:
+there is no way to change the altitude from here, but for an offset in z that a held setpoint must not repeat.
 
-https://mavlink.io/en/messages/common.html#SET_POSITION_TARGET_LOCAL_NED
+https://mavlink.io/en/messages/common.html#SET_POSITION_TARGET_LOCAL_NED,
+https://mavlink.io/en/messages/common.html#SET_POSITION_TARGET_GLOBAL_INT
 """
 
 from __future__ import annotations
@@ -13,7 +14,17 @@ import math
 import struct
 from typing import Final
 
-from companion.guidance.setpoint import LocalSetpoint, Rewrite, TypeMask
+from companion.guidance.setpoint import (
+    GlobalSetpoint,
+    LocalSetpoint,
+    Replacement,
+    Rewrite,
+    RewriteGlobal,
+    RewriteOffset,
+    RewriteVelocity,
+    Setpoint,
+    TypeMask,
+)
 from companion.mavlink.framing import (
     CHECKSUM_BYTES,
     HEADER_V1,
@@ -32,13 +43,17 @@ _LOCAL: Final = struct.Struct("<I11fHBBB")
 _GLOBAL: Final = struct.Struct("<Iii9fHBBB")
 _ATTITUDE: Final = struct.Struct("<I8fBBB3f")
 _FLOAT: Final = struct.Struct("<f")
-_X_Y: Final = struct.Struct("<2f")
-_YAW_RATE_MASK: Final = struct.Struct("<2fH")
+_TWO_FLOATS: Final = struct.Struct("<2f")
+_TWO_INTS: Final = struct.Struct("<2i")
+_MASK: Final = struct.Struct("<H")
 
-# Offsets in the payload.
+# Offsets in the payload of both messages.
 _X: Final = 4
+_Z: Final = 12
 _VX: Final = 16
+_ACCELERATION: Final = slice(28, 40)
 _YAW: Final = 40
+_TYPE_MASK: Final = 48
 
 _FLOATS: Final = (
     (4, TypeMask.X_IGNORE),
@@ -53,11 +68,9 @@ _FLOATS: Final = (
     (40, TypeMask.YAW_IGNORE),
     (44, TypeMask.YAW_RATE_IGNORE),
 )
-"""Offset of each float of the payload and the bit of type_mask that ignores it."""
+"""Offset of each float of the payload and the bit of type_mask that ignores it (GLOBAL_INT: from z on)."""
 
-_POSITION_ONLY: Final = int(
-    TypeMask.VELOCITY_IGNORE | TypeMask.ACCELERATION_IGNORE | TypeMask.YAW_RATE_IGNORE
-)
+_NOT_FORCE: Final = 0x0FFF & ~int(TypeMask.FORCE_SET)
 
 # ATTITUDE_TARGET_TYPEMASK
 _BODY_RATE_IGNORE: Final = (1, 2, 4)
@@ -76,51 +89,123 @@ def unpack_local(frame: RawFrame) -> LocalSetpoint:
     """
     if frame.message_id != SET_POSITION_TARGET_LOCAL_NED:
         raise ValueError(f"expected message {SET_POSITION_TARGET_LOCAL_NED}, got {frame.message_id}")
-    values = _LOCAL.unpack_from(_padded(frame, _LOCAL.size))
-    return LocalSetpoint(*values)
+    return LocalSetpoint(*_LOCAL.unpack_from(_padded(frame, _LOCAL.size)))
 
 
-def rewrite(frame: RawFrame, new: Rewrite) -> bytes:
-    """Return the frame with x, y, yaw and type_mask replaced and all further terms ignored.
-
-    Velocity, acceleration and yaw_rate are ignored by type_mask and written as 0, so that nothing that the
-    planner added keeps pointing where it should not; FORCE_SET is cleared. A MAVLink 2 payload is trimmed again,
-    a MAVLink 1 frame stays one.
-
-    Parameters
-    ----------
-    frame
-        A verified, unsigned SET_POSITION_TARGET_LOCAL_NED that uses x, y and z.
-    new
-        Position in local NED (m) and yaw (rad).
+def unpack_global(frame: RawFrame) -> GlobalSetpoint:
+    """Return the fields of a SET_POSITION_TARGET_GLOBAL_INT frame; a trimmed payload is padded with zeros.
 
     Raises
     ------
     ValueError
-        When the frame may not be rewritten (another message, signed, unknown incompatibility flags, x, y or z
-        not used), or a new value is not finite or does not fit a float32.
+        When the frame is of another message.
     """
-    if frame.message_id != SET_POSITION_TARGET_LOCAL_NED:
-        raise ValueError(f"expected message {SET_POSITION_TARGET_LOCAL_NED}, got {frame.message_id}")
+    if frame.message_id != SET_POSITION_TARGET_GLOBAL_INT:
+        raise ValueError(f"expected message {SET_POSITION_TARGET_GLOBAL_INT}, got {frame.message_id}")
+    return GlobalSetpoint(*_GLOBAL.unpack_from(_padded(frame, _GLOBAL.size)))
+
+
+def unpack(frame: RawFrame) -> Setpoint | None:
+    """Return the fields of a setpoint of position or velocity, or None where the frame is of another message."""
+    match frame.message_id:
+        case message_id if message_id == SET_POSITION_TARGET_LOCAL_NED:
+            return unpack_local(frame)
+        case message_id if message_id == SET_POSITION_TARGET_GLOBAL_INT:
+            return unpack_global(frame)
+    return None
+
+
+def rewrite(frame: RawFrame, new: Replacement) -> bytes:
+    """Return the frame with what moves the vehicle horizontally, and yaw, replaced.
+
+    Of the planner's further terms none keeps pointing where it should not: what ``new`` does not set of the
+    horizontal velocity, acceleration and yaw_rate is ignored by type_mask and written as 0; FORCE_SET is cleared. A
+    MAVLink 2 payload is trimmed again, a MAVLink 1 frame stays one.
+
+    Parameters
+    ----------
+    frame
+        A verified, unsigned setpoint of the message and kind that ``new`` is for.
+    new
+        What is set, in the message's own frame.
+
+    Raises
+    ------
+    ValueError
+        When the frame may not be rewritten (another message or kind, signed, unknown incompatibility flags), or a new
+        value is not finite or does not fit its field.
+    """
+    wanted = (
+        SET_POSITION_TARGET_GLOBAL_INT if isinstance(new, RewriteGlobal) else SET_POSITION_TARGET_LOCAL_NED
+    )
+    either = isinstance(new, RewriteVelocity) and frame.message_id == SET_POSITION_TARGET_GLOBAL_INT
+    if frame.message_id != wanted and not either:
+        raise ValueError(f"expected message {wanted}, got {frame.message_id}")
+    values = _values(new)
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"not finite: {new}")
     payload = _patchable(frame, _LOCAL.size)
-    (type_mask,) = struct.unpack_from("<H", payload, 48)
-    if type_mask & TypeMask.POSITION_IGNORE:
-        raise ValueError(f"type_mask {type_mask} ignores a part of the position")
-    yaw = 0.0 if new.yaw is None else new.yaw
-    if not (math.isfinite(new.x) and math.isfinite(new.y) and math.isfinite(yaw)):
-        raise ValueError(f"not finite: x {new.x}, y {new.y}, yaw {new.yaw}")
-    mask = _POSITION_ONLY if new.yaw is not None else _POSITION_ONLY | TypeMask.YAW_IGNORE
+    (type_mask,) = _MASK.unpack_from(payload, _TYPE_MASK)
     try:
-        _X_Y.pack_into(payload, _X, new.x, new.y)
-        payload[_VX:_YAW] = bytes(_YAW - _VX)
-        _YAW_RATE_MASK.pack_into(payload, _YAW, yaw, 0.0, mask)
-    except OverflowError as error:
-        raise ValueError(f"does not fit a float32: x {new.x}, y {new.y}, yaw {new.yaw}") from error
+        if isinstance(new, RewriteVelocity):
+            _patch_velocity(payload, new)
+            keeps = TypeMask.POSITION_IGNORE | TypeMask.VZ_IGNORE
+            mask = type_mask & keeps | TypeMask.ACCELERATION_IGNORE
+        else:
+            mask = _patch_position(payload, type_mask, new)
+        payload[_ACCELERATION] = bytes(12)
+        _TWO_FLOATS.pack_into(payload, _YAW, 0.0 if new.yaw is None else new.yaw, 0.0)
+    except (OverflowError, struct.error) as error:
+        raise ValueError(f"does not fit its field (a float32 or an int32): {new}") from error
+    mask |= TypeMask.YAW_RATE_IGNORE | (TypeMask.YAW_IGNORE if new.yaw is None else 0)
+    _MASK.pack_into(payload, _TYPE_MASK, mask & _NOT_FORCE)
+    _zero_ignored(payload, mask, frame.message_id)
     return _reassemble(frame, payload)
 
 
+def _values(new: Replacement) -> tuple[float, ...]:
+    yaw = 0.0 if new.yaw is None else new.yaw
+    match new:
+        case Rewrite():
+            return new.x, new.y, yaw
+        case RewriteOffset():
+            return new.x, new.y, yaw, 0.0 if new.z is None else new.z
+        case RewriteVelocity():
+            return new.vx, new.vy, yaw
+        case RewriteGlobal():
+            return (yaw,)
+
+
+def _patch_velocity(payload: bytearray, new: RewriteVelocity) -> None:
+    _TWO_FLOATS.pack_into(payload, _VX, new.vx, new.vy)
+
+
+def _patch_position(payload: bytearray, type_mask: int, new: Rewrite | RewriteOffset | RewriteGlobal) -> int:
+    """Set the position and return the bits of type_mask for it; velocities are ignored, but for a vz that stands for z."""
+    if type_mask & (TypeMask.X_IGNORE | TypeMask.Y_IGNORE):
+        raise ValueError(f"type_mask {type_mask} ignores x or y")
+    climbs = bool(type_mask & TypeMask.Z_IGNORE)
+    if climbs and (not isinstance(new, Rewrite) or type_mask & TypeMask.VZ_IGNORE):
+        raise ValueError(f"type_mask {type_mask} ignores z, and no vz stands for it")
+    if isinstance(new, RewriteGlobal):
+        _TWO_INTS.pack_into(payload, _X, new.lat_int, new.lon_int)
+    else:
+        _TWO_FLOATS.pack_into(payload, _X, new.x, new.y)
+    if isinstance(new, RewriteOffset) and new.z is not None:
+        _FLOAT.pack_into(payload, _Z, new.z)
+    ignored = TypeMask.ACCELERATION_IGNORE | TypeMask.VX_IGNORE | TypeMask.VY_IGNORE
+    return int(ignored | (TypeMask.Z_IGNORE if climbs else TypeMask.VZ_IGNORE))
+
+
+def _zero_ignored(payload: bytearray, mask: int, message_id: int) -> None:
+    """Write 0 into every float that type_mask ignores: what is there may be NaN."""
+    for offset, ignore in _floats_of(message_id):
+        if mask & ignore:
+            payload[offset : offset + 4] = bytes(4)
+
+
 def sanitise(frame: RawFrame) -> bytes:
-    """Return the frame with 0 in every float field that type_mask ignores and that is NaN or infinite.
+    """Return the setpoint with 0 in every float field that type_mask ignores and that is NaN or infinite.
 
     Without such a field the frame comes back byte for byte.
 
@@ -130,10 +215,10 @@ def sanitise(frame: RawFrame) -> bytes:
         When there is such a field and the frame may not be changed (signed, unknown incompatibility flags).
     """
     padded = _padded(frame, _LOCAL.size)
-    (type_mask,) = struct.unpack_from("<H", padded, 48)
+    (type_mask,) = _MASK.unpack_from(padded, _TYPE_MASK)
     offsets = [
         offset
-        for offset, ignore in _FLOATS
+        for offset, ignore in _floats_of(frame.message_id)
         if type_mask & ignore and not math.isfinite(_FLOAT.unpack_from(padded, offset)[0])
     ]
     if not offsets:
@@ -144,19 +229,8 @@ def sanitise(frame: RawFrame) -> bytes:
     return _reassemble(frame, payload)
 
 
-def global_nonfinite_used_fields(frame: RawFrame) -> tuple[str, ...]:
-    """Return the names of used float fields of a SET_POSITION_TARGET_GLOBAL_INT that are NaN or infinite.
-
-    Latitude and longitude are integers and always finite.
-    """
-    values = _GLOBAL.unpack_from(_padded(frame, _GLOBAL.size))
-    names = ("alt", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
-    type_mask = values[12]
-    return tuple(
-        name
-        for name, value, (_, ignore) in zip(names, values[3:12], _FLOATS[2:], strict=True)
-        if not type_mask & ignore and not math.isfinite(value)
-    )
+def _floats_of(message_id: int) -> tuple[tuple[int, TypeMask], ...]:
+    return _FLOATS[2:] if message_id == SET_POSITION_TARGET_GLOBAL_INT else _FLOATS
 
 
 def attitude_nonfinite_used_fields(frame: RawFrame) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The inline proxy: every frame goes through as it came, position setpoints as the handler decides.
+"""The inline proxy: every frame goes through as it came, setpoints of position and velocity as the handler decides.
 
 Everything happens in the call that received a datagram: no queue, no task, no wait. So order holds, nothing
 can stall, and several frames of one datagram leave as one datagram again.
@@ -10,9 +10,10 @@ setpoint                                             sent to the autopilot
 ===================================================  ===================================================
 a used field is NaN or infinite                      nothing; counted
 signed, or with unknown incompatibility flags        untouched; announced as unprotected
-82, 86, or 84 of a kind that is not handled          untouched; announced as unprotected
+an attitude (82)                                     untouched; announced as unprotected
 for a system that is not the vehicle                 untouched
-a position in LOCAL_NED                              what the handler says: `Forward`, `Rewrite` or `Drop`
+a position or velocity (84, 86)                      what the handler says: `Forward`, one of the replacements,
+                                                     `Drop`, or `Unprotected`: untouched and announced
 the handler fails                                    nothing; counted and logged
 ===================================================  ===================================================
 """
@@ -25,12 +26,23 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
-from companion.guidance.setpoint import Drop, Forward, LocalSetpoint, Rewrite, Verdict
+from companion.guidance.setpoint import (
+    Drop,
+    Forward,
+    Rewrite,
+    RewriteGlobal,
+    RewriteOffset,
+    RewriteVelocity,
+    Setpoint,
+    Unprotected,
+    Verdict,
+)
 from companion.mavlink import codec, requests, telemetry
 from companion.mavlink.framing import RawFrame
 from companion.mavlink.identity import is_autopilot
 from companion.mavlink.link import FrameReceiver, LinkCounters
 from companion.mavlink.requests import EngageRequest
+from companion.mavlink.sources import SetpointSources, Source
 from companion.mavlink.telemetry import Heartbeat, Telemetry, Unusable
 
 _LOG: Final = logging.getLogger(__name__)
@@ -49,8 +61,12 @@ _VEHICLE_SILENT_NS: Final = 5_000_000_000
 class ProxyHandler(Protocol):
     """Decides on setpoints and takes telemetry. Every call must return at once."""
 
-    def on_setpoint(self, setpoint: LocalSetpoint, system_id: int, component_id: int, now_ns: int) -> Verdict:
-        """Return what is sent in place of a position setpoint; the ids are the sender's."""
+    def on_setpoint(self, setpoint: Setpoint, system_id: int, component_id: int, now_ns: int) -> Verdict:
+        """Return what is sent in place of a setpoint of position or velocity; the ids are the sender's."""
+        ...
+
+    def on_rivals(self, sources: tuple[Source, ...], now_ns: int) -> None:
+        """Take note that several senders fight over the vehicle with their setpoints; called every few seconds."""
         ...
 
     def on_unprotected(self, kind: str, detail: str) -> None:
@@ -96,7 +112,7 @@ class ProxyCounters:
     to_autopilot_frames, to_planner_frames
         Frames passed on, rewritten setpoints included.
     setpoints_in
-        SET_POSITION_TARGET_LOCAL_NED for the vehicle. Each of them is forwarded, rewritten or dropped.
+        SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT for the vehicle. Each is forwarded, rewritten or dropped.
     forwarded
         Those passed on with all their values, unprotected ones included.
     rewritten
@@ -107,6 +123,8 @@ class ProxyCounters:
         Setpoints of any message that passed untouched although they move the vehicle, by kind.
     setpoints_elsewhere
         Setpoints for other systems.
+    rivalries
+        Times that several senders were found to fight over the vehicle.
     handler_errors
         Failures of the handler, and verdicts that cannot be carried out.
     unusable_telemetry
@@ -123,6 +141,7 @@ class ProxyCounters:
     dropped: Counter[str] = field(default_factory=Counter)
     unprotected: Counter[str] = field(default_factory=Counter)
     setpoints_elsewhere: int = 0
+    rivalries: int = 0
     handler_errors: int = 0
     unusable_telemetry: int = 0
 
@@ -135,6 +154,7 @@ class ProxyCounters:
             "dropped": dict(self.dropped),
             "unprotected": dict(self.unprotected),
             "setpoints_elsewhere": self.setpoints_elsewhere,
+            "rivalries": self.rivalries,
             "to_autopilot_frames": self.to_autopilot_frames,
             "to_planner_frames": self.to_planner_frames,
             "handler_errors": self.handler_errors,
@@ -169,6 +189,7 @@ class InlineProxy:
         self._vehicle_heard_ns = 0
         self._autopilot_systems: set[int] = set()
         self._last_failure = ""
+        self._sources = SetpointSources()
         planner.on_frames = self._from_planner
         autopilot.on_frames = self._from_autopilot
 
@@ -209,15 +230,11 @@ class InlineProxy:
     def _setpoint(self, frame: RawFrame, now_ns: int) -> bytes:
         """Return what is sent in place of a setpoint frame; nothing where it is dropped."""
         counters = self.counters
-        setpoint: LocalSetpoint | None = None
-        match frame.message_id:
-            case codec.SET_POSITION_TARGET_LOCAL_NED:
-                setpoint = codec.unpack_local(frame)
-                nonfinite = setpoint.nonfinite_used_fields()
-            case codec.SET_POSITION_TARGET_GLOBAL_INT:
-                nonfinite = codec.global_nonfinite_used_fields(frame)
-            case _:
-                nonfinite = codec.attitude_nonfinite_used_fields(frame)
+        setpoint = codec.unpack(frame)
+        if setpoint is None:
+            nonfinite = codec.attitude_nonfinite_used_fields(frame)
+        else:
+            nonfinite = setpoint.nonfinite_used_fields()
         target = codec.target_system(frame)
         # Before the autopilot has been heard, every target may be the vehicle.
         is_elsewhere = bool(target and self._autopilot_systems and target not in self._autopilot_systems)
@@ -227,6 +244,7 @@ class InlineProxy:
         if is_elsewhere:
             counters.setpoints_elsewhere += 1
             return frame.data
+        self._note_source(frame, now_ns)
         name = _NAMES[frame.message_id]
         if frame.is_signed:
             return self._unprotected(frame, "signed", name)
@@ -234,9 +252,6 @@ class InlineProxy:
             return self._unprotected(frame, name, f"incompatibility flags {frame.incompat_flags:#x}")
         if setpoint is None:
             return self._unprotected(frame, name, "not handled")
-        reason = setpoint.unprotected_reason()
-        if reason is not None:
-            return self._unprotected(frame, name, reason)
         try:
             verdict = self._handler.on_setpoint(setpoint, frame.system_id, frame.component_id, now_ns)
             return self._carry_out(verdict, frame)
@@ -244,13 +259,23 @@ class InlineProxy:
             self._handler_failed("on_setpoint", error)
             return self._dropped("handler error")
 
+    def _note_source(self, frame: RawFrame, now_ns: int) -> None:
+        rivals = self._sources.note((frame.system_id, frame.component_id), now_ns)
+        if not rivals:
+            return
+        self.counters.rivalries += 1
+        try:
+            self._handler.on_rivals(rivals, now_ns)
+        except Exception as error:  # noqa: BLE001  a failed announcement must not cost the frame
+            self._handler_failed("on_rivals", error)
+
     def _carry_out(self, verdict: Verdict, frame: RawFrame) -> bytes:
         match verdict:
             case Forward():
                 data = codec.sanitise(frame)
                 self.counters.forwarded += 1
                 return data
-            case Rewrite():
+            case Rewrite() | RewriteOffset() | RewriteVelocity() | RewriteGlobal():
                 if verdict.action not in _ACTIONS:
                     raise ValueError(f"action {verdict.action!r}, expected one of {_ACTIONS}")
                 data = codec.rewrite(frame, verdict)
@@ -258,6 +283,8 @@ class InlineProxy:
                 return data
             case Drop():
                 return self._dropped(verdict.reason)
+            case Unprotected():
+                return self._unprotected(frame, _NAMES[frame.message_id], verdict.reason)
         raise TypeError(f"not a verdict: {verdict!r}")
 
     def _dropped(self, reason: str) -> bytes:
@@ -266,7 +293,7 @@ class InlineProxy:
 
     def _unprotected(self, frame: RawFrame, kind: str, detail: str) -> bytes:
         self.counters.unprotected[kind] += 1
-        self.counters.forwarded += frame.message_id == codec.SET_POSITION_TARGET_LOCAL_NED
+        self.counters.forwarded += frame.message_id != codec.SET_ATTITUDE_TARGET
         try:
             self._handler.on_unprotected(kind, detail)
         except Exception as error:  # noqa: BLE001  a failed announcement must not cost the frame

@@ -85,6 +85,23 @@ class Odometry:
 
 
 @dataclass(frozen=True, slots=True)
+class GlobalPosition:
+    """What is needed of GLOBAL_POSITION_INT: latitude and longitude in 1e-7 deg."""
+
+    time_boot_ms: int
+    lat_int: int
+    lon_int: int
+
+
+@dataclass(frozen=True, slots=True)
+class GlobalOrigin:
+    """GPS_GLOBAL_ORIGIN: where local NED begins, in 1e-7 deg."""
+
+    lat_int: int
+    lon_int: int
+
+
+@dataclass(frozen=True, slots=True)
 class ExtendedSysState:
     """EXTENDED_SYS_STATE; landed_state: 0 undefined, 1 on ground, 2 in air, 3 taking off, 4 landing."""
 
@@ -100,7 +117,16 @@ class Unusable:
     reason: str
 
 
-Telemetry = Heartbeat | Attitude | AttitudeQuaternion | LocalPosition | Odometry | ExtendedSysState
+Telemetry = (
+    Heartbeat
+    | Attitude
+    | AttitudeQuaternion
+    | LocalPosition
+    | GlobalPosition
+    | GlobalOrigin
+    | Odometry
+    | ExtendedSysState
+)
 
 
 class VehicleMode(NamedTuple):
@@ -113,6 +139,8 @@ class VehicleMode(NamedTuple):
 _HEARTBEAT: Final = struct.Struct("<IBBBBB")
 _SIX_FLOATS: Final = struct.Struct("<I6f")
 _QUATERNION: Final = struct.Struct("<I7f")
+_GLOBAL_POSITION: Final = struct.Struct("<Iii")
+_GLOBAL_ORIGIN: Final = struct.Struct("<ii")
 _TIME_USEC: Final = struct.Struct("<Q")
 _RESET_COUNTER_OFFSET: Final = 230
 _ODOMETRY_BYTES: Final = 233
@@ -180,6 +208,22 @@ def _attitude_quaternion(frame: RawFrame) -> AttitudeQuaternion | Unusable:
     return AttitudeQuaternion(time_boot_ms, q, rollspeed, pitchspeed, yawspeed)
 
 
+def _global_position(frame: RawFrame) -> GlobalPosition | Unusable:
+    time_boot_ms, lat_int, lon_int = _GLOBAL_POSITION.unpack_from(_padded(frame, _GLOBAL_POSITION.size))
+    if not _on_globe(lat_int, lon_int):
+        return Unusable(frame.message_id, "not on the globe")
+    return GlobalPosition(time_boot_ms, lat_int, lon_int)
+
+
+def _global_origin(frame: RawFrame) -> GlobalOrigin | Unusable:
+    lat_int, lon_int = _GLOBAL_ORIGIN.unpack_from(_padded(frame, _GLOBAL_ORIGIN.size))
+    return GlobalOrigin(lat_int, lon_int) if _on_globe(lat_int, lon_int) else Unusable(49, "not on the globe")
+
+
+def _on_globe(lat_int: int, lon_int: int) -> bool:
+    return abs(lat_int) <= 900_000_000 and abs(lon_int) <= 1_800_000_000
+
+
 def _odometry(frame: RawFrame) -> Odometry:
     payload = _padded(frame, _ODOMETRY_BYTES)
     return Odometry(_TIME_USEC.unpack_from(payload)[0], payload[_RESET_COUNTER_OFFSET])
@@ -204,6 +248,8 @@ _READERS: Final[dict[int, Callable[[RawFrame], Telemetry | Unusable]]] = {
     30: _attitude,
     31: _attitude_quaternion,
     32: _local_position,
+    33: _global_position,
+    49: _global_origin,
     245: _extended_sys_state,
     331: _odometry,
 }

@@ -13,12 +13,12 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.guidance.setpoint import LocalSetpoint
+from companion.guidance.setpoint import LocalSetpoint, Setpoint
 from companion.sim.commander import Result
 from companion.sim.flight_controller import FlightController
 from companion.sim.px4_modes import FlightMode, mode_from_numbers
 from companion.sim.telemetry import STREAMS, StreamSchedule
-from companion.sim.wire import FrameReader, FrameWriter, ReceivedFrame, local_setpoint
+from companion.sim.wire import FrameReader, FrameWriter, ReceivedFrame, global_setpoint, local_setpoint
 
 Address = tuple[str, int]
 
@@ -146,7 +146,12 @@ class AutopilotEndpoint:
     def _answer(self, frame: ReceivedFrame, now_ns: int, sender: Address) -> list[Any]:
         message = frame.message
         if frame.name == "SET_POSITION_TARGET_LOCAL_NED":
-            self._take_setpoint(frame, now_ns, sender)
+            setpoint = local_setpoint(message)
+            refusal = self._take_setpoint(setpoint, now_ns)
+            self._record(frame, setpoint, refusal, now_ns, sender)
+            return []
+        if frame.name == "SET_POSITION_TARGET_GLOBAL_INT":
+            self._take_setpoint(global_setpoint(message), now_ns)
             return []
         if message is None or not self._is_for_us(message):
             return []
@@ -193,9 +198,14 @@ class AutopilotEndpoint:
         component = getattr(message, "target_component", 0)
         return system in (0, self._system_id) and component in (0, self._component_id)
 
-    def _take_setpoint(self, frame: ReceivedFrame, now_ns: int, sender: Address) -> None:
-        setpoint = local_setpoint(frame.message)
+    def _take_setpoint(self, setpoint: Setpoint, now_ns: int) -> str | None:
+        """Hand a setpoint on; return why it was not taken."""
         refusal = self.controller.take_setpoint(setpoint, now_ns)
+        return None if refusal is None else refusal.reason
+
+    def _record(
+        self, frame: ReceivedFrame, setpoint: LocalSetpoint, refusal: str | None, now_ns: int, sender: Address
+    ) -> None:
         self.setpoints.append(
             SetpointRecord(
                 time_ns=now_ns,
@@ -205,7 +215,7 @@ class AutopilotEndpoint:
                 system_id=frame.system_id,
                 component_id=frame.component_id,
                 sender=sender,
-                refusal=None if refusal is None else refusal.reason,
+                refusal=refusal,
             )
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 
-from companion.guidance.setpoint import LocalSetpoint
+from companion.guidance.setpoint import Setpoint
 from companion.sim.commander import Answer, Commander, Result
 from companion.sim.estimate_errors import ErringEstimate
 from companion.sim.navigator import Navigator, Situation
@@ -155,10 +155,14 @@ class FlightController:
             self._now_ns = min(now_ns, self._now_ns + max(1, round(dt_s * 1e9)))
             self._step(dt_s)
 
-    def take_setpoint(self, setpoint: LocalSetpoint, now_ns: int) -> Refusal | None:
+    def take_setpoint(self, setpoint: Setpoint, now_ns: int) -> Refusal | None:
         """Take a setpoint as PX4 would; return why not, where it is refused."""
         answer = interpret(
-            setpoint, self.estimate.yaw_rad, system_id=self._system_id, component_id=self._component_id
+            setpoint,
+            self.estimate.yaw_rad,
+            system_id=self._system_id,
+            component_id=self._component_id,
+            home_down_m=self._home[2],
         )
         if isinstance(answer, Refusal):
             return answer

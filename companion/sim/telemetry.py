@@ -17,7 +17,9 @@ from companion.sim.px4_modes import FlightMode
 from companion.sim.vehicle import Target, Vector3, VehicleState
 
 _METRES_PER_DEGREE = 111_319.5
-_ORIGIN_LAT_DEG, _ORIGIN_LON_DEG, _ORIGIN_ALT_M = 47.397742, 8.545594, 488.0
+_ORIGIN_LAT_DEG, _ORIGIN_LON_DEG = 47.397742, 8.545594
+ORIGIN_ALT_M = 488.0
+"""Altitude of the origin of local NED."""
 _NAN = float("nan")
 
 _SENSORS = (
@@ -203,7 +205,7 @@ def _gps_raw_int(s: Snapshot) -> Any:
 def _altitude(s: Snapshot) -> Any:
     height_m = -s.vehicle.position_ned_m[2]
     above_home_m = s.home_ned_m[2] + height_m
-    altitude_m = _ORIGIN_ALT_M + height_m
+    altitude_m = ORIGIN_ALT_M + height_m
     return mavlink.MAVLink_altitude_message(
         s.time_boot_us, altitude_m, altitude_m, height_m, above_home_m, _NAN, _NAN
     )
@@ -213,7 +215,7 @@ def _vfr_hud(s: Snapshot) -> Any:
     north, east, down = s.vehicle.velocity_ned_m_s
     heading_deg = _centidegrees(s.vehicle.yaw_rad) // 100
     return mavlink.MAVLink_vfr_hud_message(
-        0.0, math.hypot(north, east), heading_deg, 0, _ORIGIN_ALT_M - s.vehicle.position_ned_m[2], -down
+        0.0, math.hypot(north, east), heading_deg, 0, ORIGIN_ALT_M - s.vehicle.position_ned_m[2], -down
     )
 
 
@@ -255,7 +257,7 @@ def _global_of(position_ned_m: Vector3) -> tuple[int, int, int]:
     north, east, down = position_ned_m
     lat_deg = _ORIGIN_LAT_DEG + north / _METRES_PER_DEGREE
     lon_deg = _ORIGIN_LON_DEG + east / (_METRES_PER_DEGREE * math.cos(math.radians(_ORIGIN_LAT_DEG)))
-    return round(lat_deg * 1e7), round(lon_deg * 1e7), round((_ORIGIN_ALT_M - down) * 1000)
+    return round(lat_deg * 1e7), round(lon_deg * 1e7), round((ORIGIN_ALT_M - down) * 1000)
 
 
 def _centidegrees(azimuth_rad: float) -> int:
@@ -346,3 +348,10 @@ class StreamSchedule:
             missed = (time_boot_us - due_us) // interval
             self._due_us[message_id] = due_us + (missed + 1) * interval
         return ids
+
+
+def local_of(lat_int: int, lon_int: int) -> tuple[float, float]:
+    """Return north and east (m) of a latitude and longitude (1e-7 degrees): the inverse of what telemetry tells."""
+    north = (lat_int * 1e-7 - _ORIGIN_LAT_DEG) * _METRES_PER_DEGREE
+    scale = _METRES_PER_DEGREE * math.cos(math.radians(_ORIGIN_LAT_DEG))
+    return north, (lon_int * 1e-7 - _ORIGIN_LON_DEG) * scale

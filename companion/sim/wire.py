@@ -13,7 +13,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.guidance.setpoint import LocalSetpoint
+from companion.guidance.setpoint import GlobalSetpoint, LocalSetpoint
 
 RECEIVE_BUFFER_BYTES = 4 << 20
 """What the simulated parties ask for, so that none of a burst is lost on loopback; the system may give less."""
@@ -136,6 +136,11 @@ def local_setpoint(message: Any) -> LocalSetpoint:
         target_component=message.target_component,
         coordinate_frame=message.coordinate_frame,
     )
+
+
+def global_setpoint(message: Any) -> GlobalSetpoint:
+    """Return a decoded SET_POSITION_TARGET_GLOBAL_INT as a value."""
+    return GlobalSetpoint(**{name: getattr(message, name) for name in GlobalSetpoint.__slots__})
 
 
 def _frame_length(datagram: bytes, place: int) -> int | None:

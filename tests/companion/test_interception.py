@@ -9,10 +9,18 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from structlog.testing import CapturingLogger
 
-from companion.config import Config, GuidanceConfig
+from companion.config import Config, GuidanceConfig, LinkConfig
 from companion.frames.source import Frame
 from companion.guidance.observation import DetectionReport
-from companion.guidance.setpoint import Drop, Forward, Rewrite
+from companion.guidance.setpoint import (
+    Drop,
+    Forward,
+    Rewrite,
+    RewriteGlobal,
+    RewriteOffset,
+    RewriteVelocity,
+    Unprotected,
+)
 from companion.guidance.substitution import State
 from companion.interception import Interception
 from companion.mavlink.identity import Identity, MavState
@@ -20,12 +28,15 @@ from companion.mavlink.requests import EngageRequest
 from companion.mavlink.telemetry import (
     Attitude,
     AttitudeQuaternion,
+    GlobalOrigin,
+    GlobalPosition,
     Heartbeat,
     LocalPosition,
     Odometry,
     Unusable,
 )
 from tests.fakes.flat_world import SEC, setpoint
+from tests.fakes.wire_flight import glob, local
 
 MS = 1_000_000
 OFFBOARD = 6 << 16
@@ -66,9 +77,9 @@ class Bench:
     def switch(self):
         return self.flight.switch
 
-    def heartbeat(self, *, mode: int = OFFBOARD, armed: bool = True) -> None:
+    def heartbeat(self, *, mode: int = OFFBOARD, armed: bool = True, autopilot: int = 12) -> None:
         base = 1 | (128 if armed else 0)
-        self.flight.on_telemetry(Heartbeat(1, 1, 2, 12, base, mode, 4), self.now)
+        self.flight.on_telemetry(Heartbeat(1, 1, 2, autopilot, base, mode, 4), self.now)
 
     def telemetry(self, seconds: float = 0.1) -> None:
         """Move on, with attitude and position every 20 ms."""
@@ -91,6 +102,10 @@ class Bench:
 
     def ask(self, x: float = 8.0, y: float = 0.0):
         return self.flight.on_setpoint(setpoint(x, y), 255, 190, self.now)
+
+    def send(self, given, sender: tuple[int, int] = (255, 190)):
+        """The verdict on a setpoint of any kind."""
+        return self.flight.on_setpoint(given, *sender, self.now)
 
     def events(self, name: str) -> list[dict]:
         return [call.kwargs for call in self.log.calls if call.args == (name,)]
@@ -348,3 +363,117 @@ def test_a_request_that_was_refused_counts_for_a_second_and_a_half():
     bench.heartbeat(mode=HOLD_MODE, armed=False)
     assert bench.switch.state is State.DISENGAGED
     assert isinstance(bench.flight.on_setpoint(setpoint(5, 0), 245, 190, bench.now), Forward)
+
+
+# ---------------------------------------------------------------- kinds of setpoints, and whose
+
+
+def flying_copter() -> Bench:
+    bench = Bench()
+    bench.heartbeat(mode=4, autopilot=3)
+    bench.telemetry()
+    bench.report()
+    return bench
+
+
+def test_each_autopilot_gets_what_it_understands():
+    px4, copter = flying(), flying_copter()
+    offset = local(3576, 9, p=(8, 0, 0))
+    assert px4.send(offset) == Unprotected("coordinate_frame 9")
+    verdict = copter.send(offset)
+    assert isinstance(verdict, RewriteOffset)
+    assert (verdict.x, verdict.y) == pytest.approx((1.5, 0.0))
+    for bench in (px4, copter):
+        verdict = bench.send(local(3527, 8, v=(0.5, 0, -0.2)))
+        assert isinstance(verdict, RewriteVelocity)
+        assert (verdict.vx, verdict.vy) == pytest.approx((0.5, 0.0))
+        assert bench.send(local(3135)) == Unprotected("acceleration only")
+
+
+def test_a_copters_yaw_in_a_body_frame_is_from_the_heading_and_px4s_is_not():
+    for bench, expected in ((flying_copter(), 0.0), (flying(), 1.0)):
+        bench.yaw = 1.0
+        bench.telemetry(0.5)
+        bench.report()
+        for _ in range(40):
+            bench.telemetry(0.06)
+            bench.report()
+            verdict = bench.send(local(3527, 8, v=(0.5, 0, 0)))
+        assert verdict.yaw == pytest.approx(expected, abs=0.01)
+
+
+def test_before_the_autopilot_is_known_what_depends_on_it_is_dropped():
+    bench = Bench()
+    bench.telemetry()
+    assert bench.send(local(3576, 9, p=(8, 0, 0))) == Drop("autopilot not known")
+    held = bench.send(local(3527, 1, v=(2, 0, 0)))
+    assert (held.vx, held.vy, held.action) == (0.0, 0.0, "held")
+
+
+def test_global_positions_need_a_reference_and_find_it_in_telemetry():
+    bench = flying()
+    place = (473977420 + 900, 85455940)  # ten metres north
+    assert bench.send(glob(3576, at=place)) == Drop("no global reference")
+    bench.flight.on_telemetry(GlobalOrigin(473977420, 85455940), bench.now)
+    bench.telemetry()
+    bench.report()
+    verdict = bench.send(glob(3576, at=place))
+    assert isinstance(verdict, RewriteGlobal)
+    assert verdict.lat_int - 473977420 == pytest.approx(1.5 / 0.01112, abs=1.5)
+    assert verdict.lon_int == 85455940
+    # the pair that is seen later is nearer to the truth than the origin
+    bench.telemetry()
+    bench.flight.on_telemetry(GlobalPosition(bench.boot_ms, 473978420, 85455940), bench.now)
+    bench.report()
+    assert bench.send(glob(3576, at=(place[0] + 1000, place[1]))).lat_int > 473978420
+    bench.flight.on_telemetry(Odometry(0, 3), bench.now)
+    bench.flight.on_telemetry(Odometry(0, 4), bench.now)  # another local frame
+    bench.telemetry()
+    assert bench.send(glob(3576, at=place)) == Drop("no global reference")
+
+
+def test_velocity_forward_passes_untouched_and_says_so():
+    bench = Bench(Config(guidance=GuidanceConfig(velocity="forward")))
+    bench.heartbeat()
+    bench.telemetry()
+    assert bench.send(local(3527, 1, v=(2, 0, 0))) == Unprotected("velocity only")
+    assert isinstance(bench.send(local(3576, 1, p=(8, 0, -1))), Rewrite)
+
+
+@pytest.mark.parametrize(
+    ("link", "treated", "untreated"),
+    [
+        ({}, [(255, 190), (1, 1)], []),
+        ({"planner_system_id": 245}, [(245, 190), (245, 1)], [(255, 190)]),
+        ({"planner_system_id": 245, "planner_component_id": 190}, [(245, 190)], [(245, 1), (255, 190)]),
+    ],
+)
+def test_only_the_planners_setpoints_are_treated(link, treated, untreated):
+    bench = Bench(Config(link=LinkConfig(**link)))
+    bench.heartbeat()
+    bench.telemetry()
+    for sender in treated:
+        assert isinstance(bench.send(setpoint(8, 0), sender), Rewrite)
+    for sender in untreated:
+        verdict = bench.send(setpoint(8, 0), sender)
+        assert verdict == Unprotected(f"from {sender[0]}/{sender[1]}, not the planner")
+
+
+def test_rivals_are_announced():
+    bench = flying()
+    bench.flight.on_rivals(((245, 190), (255, 190)), bench.now)
+    assert bench.events("rival_setpoints")[0]["sources"] == ["245/190", "255/190"]
+    assert "void: setpoints from 245/190 and 255/190" in bench.wire.texts()
+
+
+def test_the_status_says_what_was_asked_for_and_what_is_sent_for_every_kind():
+    bench = flying()
+    bench.send(local(3527, 1, v=(0.5, 0, -0.25)))
+    shown = bench.flight.status(bench.now)["setpoint"]
+    assert (shown["planned"], shown["sent"], shown["action"]) == (
+        [0.5, 0, -0.25],
+        [0.5, 0.0, -0.25],
+        "substituted",
+    )
+    bench.send(glob(3576, at=(1, 2)))
+    assert bench.flight.status(bench.now)["setpoint"]["dropped"] == "no global reference"

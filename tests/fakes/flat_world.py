@@ -11,9 +11,11 @@ from dataclasses import dataclass, field
 
 from companion.config import GuidanceConfig
 from companion.guidance.coordinates import quaternion_from_euler, wrap_rad
+from companion.guidance.dialect import Autopilot, Motion, Reading
 from companion.guidance.observation import BearingRange, DetectionReport, Pose
-from companion.guidance.setpoint import Drop, Forward, LocalSetpoint, Rewrite, Verdict
+from companion.guidance.setpoint import Decision, Drop, Forward, LocalSetpoint, Rewrite
 from companion.guidance.substitution import GaveUp, State, StateChanged, Switch
+from companion.guidance.wish import Wish, wish_of
 
 SEC = 1_000_000_000
 RADIUS_M = 0.35
@@ -33,6 +35,18 @@ def setpoint(
     if mask is None:
         mask = 3576 if yaw is None else 2552
     return LocalSetpoint(0, x, y, z, 0, 0, 0, 0, 0, 0, yaw or 0.0, 0, mask, 1, 1, 1)
+
+
+def wish(goal: LocalSetpoint, config: GuidanceConfig | None = None) -> Wish:
+    """What a position in LOCAL_NED asks for."""
+    return wish_of(
+        goal,
+        Reading(Motion.POSITION),
+        pose=None,
+        anchor=None,
+        autopilot=Autopilot.PX4,
+        config=config or GuidanceConfig(),
+    )
 
 
 def _ray_hit(n: float, e: float, azimuth: float, walls: list[Wall]) -> tuple[float, int]:
@@ -89,7 +103,7 @@ class Flight:
         self.now = 10 * SEC
         self.switch = Switch(self.config)
         self.vn = self.ve = 0.0
-        self.verdicts: list[tuple[int, Verdict]] = []
+        self.verdicts: list[tuple[int, Decision]] = []
         self.changes: list[StateChanged] = []
         self.gave_up: list[GaveUp] = []
         self.min_clearance = math.inf
@@ -168,28 +182,36 @@ class Flight:
             earlier_frame_ns=earlier_ns,
         )
 
-    def step(self, goal: LocalSetpoint | None, dt: float = 0.05) -> Verdict | None:
+    def step(self, goal: LocalSetpoint | None, dt: float = 0.05) -> Decision | None:
         """One planner period: telemetry, a report every 0.2 s, one setpoint, then the vehicle moves."""
+        self.sense(dt)
+        verdict = None
+        if goal is not None:
+            verdict = self.switch.on_setpoint(wish(goal), self.now)
+            self.verdicts.append((self.now, verdict))
+            self._fly(goal, verdict, dt)
+        self.note()
+        return verdict
+
+    def sense(self, dt: float) -> None:
+        """What comes in within one planner period, before its setpoint."""
         self.now += round(dt * 1e9)
         self.switch.on_vehicle(armed=self.armed, offboard=self.offboard, now_ns=self.now)
         if self.poses_alive:
             self.switch.on_pose(self.pose(), math.hypot(self.vn, self.ve))
         if self.camera_alive and round(self.now / 1e9 / dt) % round(0.2 / dt) == 0:
             self.switch.on_report(self.report(), self.now)
-        verdict = None
-        if goal is not None:
-            verdict = self.switch.on_setpoint(goal, self.now)
-            self.verdicts.append((self.now, verdict))
-            self._fly(goal, verdict, dt)
+
+    def note(self) -> None:
+        """What the switch said, and how near the walls are."""
         for event in self.switch.drain_events():
             if isinstance(event, StateChanged):
                 self.changes.append(event)
             else:
                 self.gave_up.append(event)
         self.min_clearance = min(self.min_clearance, clearance_m(self.n, self.e, self.walls))
-        return verdict
 
-    def _fly(self, goal: LocalSetpoint, verdict: Verdict, dt: float) -> None:
+    def _fly(self, goal: LocalSetpoint, verdict: Decision, dt: float) -> None:
         if not (self.armed and self.offboard) or isinstance(verdict, Drop):
             self.vn = self.ve = 0.0
             return
@@ -222,7 +244,7 @@ class Flight:
         return False
 
 
-def sent_xy(verdict: Verdict, goal: LocalSetpoint) -> tuple[float, float] | None:
+def sent_xy(verdict: Decision, goal: LocalSetpoint) -> tuple[float, float] | None:
     """Where the autopilot is sent by a verdict."""
     if isinstance(verdict, Rewrite):
         return verdict.x, verdict.y

@@ -292,7 +292,7 @@ async def test_a_nan_never_leaves_and_an_unhandled_kind_is_announced_once():
             planner.send(local(3576, x=1.0, z=-1.0, yaw=math.nan, vx=math.inf))
             for _ in range(3):
                 planner.send(local(3576, 8, x=1.0))
-                planner.send(local(int(TypeMask.POSITION_IGNORE | TypeMask.ACCELERATION_IGNORE), vx=0.3))
+                planner.send(local(int(TypeMask.POSITION_IGNORE | TypeMask.VELOCITY_IGNORE), afx=0.3))
             await asyncio.sleep(0.3)
             received = [d for d in autopilot.received if len(d) > 10 and d[7] == 84 and d[5] == 245]
             assert len(received) == 7
@@ -302,7 +302,7 @@ async def test_a_nan_never_leaves_and_an_unhandled_kind_is_announced_once():
                     math.isfinite(v) for v in (message.x, message.y, message.z, message.yaw, message.vx)
                 )
             announced = service.of("setpoint_unprotected")
-            assert sorted(e["detail"] for e in announced) == ["coordinate_frame 8", "velocity only"]
+            assert sorted(e["detail"] for e in announced) == ["acceleration only", "coordinate_frame 8"]
         await service.wait_for("status", 5, where=lambda e: sum(e["dropped"].values()) == 1)
 
 

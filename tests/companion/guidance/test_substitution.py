@@ -11,7 +11,7 @@ from companion.guidance.coordinates import wrap_rad
 from companion.guidance.observation import DetectionReport
 from companion.guidance.setpoint import Drop, Forward, Rewrite
 from companion.guidance.substitution import State
-from tests.fakes.flat_world import SEC, Flight, room, sent_xy, setpoint
+from tests.fakes.flat_world import SEC, Flight, room, sent_xy, setpoint, wish
 
 HALL = room(40.0, 40.0)
 
@@ -176,7 +176,7 @@ def test_the_pilot_takes_the_mode_and_gives_it_back():
 def test_before_the_first_heartbeat_nothing_unprotected_gets_through():
     flight = Flight(HALL)
     flight.switch.on_pose(flight.pose(), 0.0)
-    verdict = flight.switch.on_setpoint(setpoint(8, 0), flight.now)
+    verdict = flight.switch.on_setpoint(wish(setpoint(8, 0)), flight.now)
     assert isinstance(verdict, Rewrite)
     assert verdict.action == "held"
 

@@ -12,7 +12,7 @@ from companion.guidance.coordinates import quaternion_from_euler, wrap_rad
 from companion.guidance.observation import BearingRange, DetectionReport, Pose
 from companion.guidance.setpoint import Drop, Forward, LocalSetpoint, Rewrite
 from companion.guidance.substitution import State, StateChanged, Switch
-from tests.fakes.flat_world import SEC, setpoint
+from tests.fakes.flat_world import SEC, setpoint, wish
 
 MS = 1_000_000
 CONFIG = GuidanceConfig()
@@ -60,7 +60,7 @@ class Bench:
     def ask(self, goal: LocalSetpoint, dt_s: float = 0.05):
         self.now += int(dt_s * SEC)
         self.switch.on_pose(self.pose(), self.speed)
-        verdict = self.switch.on_setpoint(goal, self.now)
+        verdict = self.switch.on_setpoint(wish(goal), self.now)
         self.changes += [e for e in self.switch.drain_events() if isinstance(e, StateChanged)]
         return verdict
 
@@ -574,12 +574,12 @@ def test_noisy_ranges_at_the_limit_do_not_flap():
 
 def test_before_a_pose_nothing_is_sent_and_after_a_reset_the_new_place_is_held():
     bench = Bench()
-    assert isinstance(bench.switch.on_setpoint(AHEAD, bench.now), Drop)
+    assert isinstance(bench.switch.on_setpoint(wish(AHEAD), bench.now), Drop)
     bench = started()
     bench.void(0.0)
     bench.ask(AHEAD)
     bench.switch.on_estimator_reset(bench.now, "test")
-    assert isinstance(bench.switch.on_setpoint(AHEAD, bench.now), Drop)
+    assert isinstance(bench.switch.on_setpoint(wish(AHEAD), bench.now), Drop)
     bench.n, bench.e, bench.yaw = 30.0, -4.0, 2.0
     verdict = bench.ask(AHEAD)
     assert (verdict.x, verdict.y) == (30.0, -4.0)

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
 
-from companion.guidance.setpoint import Rewrite, TypeMask
+from companion.guidance.setpoint import Rewrite, RewriteGlobal, RewriteOffset, RewriteVelocity, TypeMask
 from companion.mavlink import codec, telemetry
 from companion.mavlink.framing import Framer, RawFrame
 
@@ -154,12 +154,121 @@ def test_sanitise_does_not_touch_used_fields():
     assert codec.unpack_local(frame).nonfinite_used_fields() == ("x",)
 
 
+def glob(mask=POSITION_ONLY, lat=473000000, lon=-85000000, alt=5.0, v=(0.0, 0.0, 0.0), a=(0.0, 0.0, 0.0), yaw=0.5,
+         yaw_rate=0.0, coordinate_frame=6):  # fmt: skip
+    return common.MAVLink_set_position_target_global_int_message(
+        1234, 1, 1, coordinate_frame, mask, lat, lon, alt, *v, *a, yaw, yaw_rate
+    )
+
+
+any_float32 = st.floats(width=32)
+int32 = st.integers(-(2**31), 2**31 - 1)
+yaws = st.none() | st.floats(-math.pi, math.pi)
+triples = st.tuples(any_float32, any_float32, any_float32)
+globals_ = st.builds(
+    glob, mask=st.integers(0, 0xFFFF), lat=int32, lon=int32, alt=any_float32, v=triples, a=triples,
+    yaw=any_float32, yaw_rate=any_float32, coordinate_frame=st.integers(0, 20),
+)  # fmt: skip
+wild_locals = st.builds(
+    local, mask=st.integers(0, 0xFFFF), x=any_float32, y=any_float32, z=any_float32, v=triples, a=triples,
+    yaw=any_float32, yaw_rate=any_float32, coordinate_frame=st.integers(0, 20),
+)  # fmt: skip
+
+
+def bits(value: float) -> bytes:
+    return struct.pack("<f", value)
+
+
+def ignored_are_zero(new) -> bool:
+    names = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
+    masks = (1, 2, 4, 8, 16, 32, 64, 128, 256, 1024, 2048)
+    return all(
+        getattr(new, name, 0.0) == 0.0 for name, bit in zip(names, masks, strict=True) if new.type_mask & bit
+    )
+
+
+@RELAXED
+@given(globals_, st.booleans())
+def test_unpack_global_reads_what_pymavlink_packed(message, v1):
+    setpoint = codec.unpack_global(frame_of(message, v1=v1))
+    for name in message.fieldnames:
+        packed, read = getattr(message, name), getattr(setpoint, name)
+        assert packed == read or (math.isnan(packed) and math.isnan(read))
+
+
+@RELAXED
+@given(wild_locals | globals_, st.booleans(), float32, float32, yaws)
+def test_a_rewritten_velocity_keeps_what_is_vertical_and_leaves_nothing_else(message, v1, vx, vy, yaw):
+    frame = frame_of(message, v1=v1, seq=77)
+    new = parsed(codec.rewrite(frame, RewriteVelocity(vx, vy, yaw, "substituted")))
+    assert (new.get_seq(), new.time_boot_ms, new.coordinate_frame) == (77, 1234, message.coordinate_frame)
+    assert (new.vx, new.vy) == (vx, vy)
+    position = 1 | 2 | 4
+    assert new.type_mask & (position | 32) == message.type_mask & (position | 32)
+    assert new.type_mask & ~(position | 32) == 64 | 128 | 256 | 2048 | (1024 if yaw is None else 0)
+    assert ignored_are_zero(new)
+    height = "alt" if new.get_msgId() == 86 else "z"
+    for name, bit in ((height, 4), ("vz", 32)):
+        kept = bits(0.0) if message.type_mask & bit else bits(getattr(message, name))
+        assert bits(getattr(new, name)) == kept
+    if new.get_msgId() == 86:
+        assert (new.lat_int, new.lon_int) == (message.lat_int, message.lon_int)
+
+
+@RELAXED
+@given(globals_, st.booleans(), int32, int32, yaws)
+def test_a_rewritten_global_position_keeps_the_altitude_and_leaves_nothing_else(message, v1, lat, lon, yaw):
+    message.type_mask &= ~7
+    new = parsed(codec.rewrite(frame_of(message, v1=v1), RewriteGlobal(lat, lon, yaw, "held")))
+    assert (new.lat_int, new.lon_int, bits(new.alt)) == (lat, lon, bits(message.alt))
+    assert new.type_mask == (POSITION_ONLY if yaw is None else POSITION_AND_YAW)
+    assert ignored_are_zero(new)
+
+
+@RELAXED
+@given(wild_locals, st.booleans(), float32, float32, st.none() | float32, yaws)
+def test_a_rewritten_offset_keeps_z_or_sets_it(message, v1, x, y, z, yaw):
+    message.type_mask &= ~7
+    new = parsed(codec.rewrite(frame_of(message, v1=v1), RewriteOffset(x, y, z, yaw, "held")))
+    assert (new.x, new.y, bits(new.z)) == (x, y, bits(message.z if z is None else z))
+    assert new.type_mask == (POSITION_ONLY if yaw is None else POSITION_AND_YAW)
+    assert ignored_are_zero(new)
+
+
+def test_a_climb_rate_in_place_of_a_height_stays():
+    frame = frame_of(local(mask=(POSITION_ONLY | 4) & ~32, z=NAN, v=(3.0, NAN, -0.25)))
+    new = codec.unpack_local(Framer().feed(codec.rewrite(frame, Rewrite(1, 2, None, "held")))[0])
+    assert (new.x, new.y, new.z, new.vx, new.vy, new.vz) == (1.0, 2.0, 0.0, 0.0, 0.0, -0.25)
+    assert new.type_mask == (POSITION_ONLY | 4) & ~32
+
+
+@pytest.mark.parametrize(
+    ("message", "new", "why"),
+    [
+        (glob(), Rewrite(1, 2, None, "held"), "expected message 84"),
+        (glob(), RewriteOffset(1, 2, None, None, "held"), "expected message 84"),
+        (local(), RewriteGlobal(1, 2, None, "held"), "expected message 86"),
+        (glob(mask=POSITION_ONLY | 1), RewriteGlobal(1, 2, None, "held"), "ignores x or y"),
+        (glob(mask=(POSITION_ONLY | 4) & ~32), RewriteGlobal(1, 2, None, "held"), "ignores z"),
+        (local(mask=(POSITION_ONLY | 4) & ~32), RewriteOffset(1, 2, None, None, "held"), "ignores z"),
+        (glob(), RewriteGlobal(2**31, 0, None, "held"), "int32"),
+        (glob(), RewriteGlobal(0, 0, NAN, "held"), "finite"),
+        (local(mask=3527), RewriteVelocity(NAN, 0, None, "held"), "finite"),
+        (local(mask=3527), RewriteVelocity(1e300, 0, None, "held"), "float32"),
+        (local(), RewriteOffset(0, 0, math.inf, None, "held"), "finite"),
+    ],
+)
+def test_a_replacement_that_does_not_fit_its_setpoint_is_refused(message, new, why):
+    with pytest.raises(ValueError, match=why):
+        codec.rewrite(frame_of(message), new)
+
+
 def test_nonfinite_used_fields_of_the_other_setpoints():
     message = common.MAVLink_set_position_target_global_int_message(
         1, 1, 1, 6, POSITION_ONLY, 473000000, 85000000, NAN, 0, 0, 0, 0, 0, 0, NAN, 0
     )
     frame = frame_of(message)
-    assert codec.global_nonfinite_used_fields(frame) == ("alt",)
+    assert codec.unpack_global(frame).nonfinite_used_fields() == ("alt",)
     assert codec.target_system(frame) == 1
     attitude = common.MAVLink_set_attitude_target_message(1, 3, 1, 7, [1, NAN, 0, 0], NAN, 0, 0, 0.5)
     assert codec.attitude_nonfinite_used_fields(frame_of(attitude)) == ("q",)

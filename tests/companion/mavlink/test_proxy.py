@@ -9,7 +9,15 @@ import struct
 import pytest
 from pymavlink.dialects.v20 import common
 
-from companion.guidance.setpoint import Drop, Forward, Rewrite
+from companion.guidance.setpoint import (
+    Drop,
+    Forward,
+    Rewrite,
+    RewriteGlobal,
+    RewriteOffset,
+    RewriteVelocity,
+    Unprotected,
+)
 from companion.mavlink.framing import Framer
 from companion.mavlink.link import LinkCounters, UdpEndpoint
 from companion.mavlink.proxy import InlineProxy
@@ -71,7 +79,7 @@ class ScriptedHandler:
 
     def __init__(self, verdict=None):
         self.verdict = Forward() if verdict is None else verdict
-        self.setpoints, self.telemetry, self.unprotected, self.requests = [], [], [], []
+        self.setpoints, self.telemetry, self.unprotected, self.requests, self.rivals = [], [], [], [], []
 
     def on_setpoint(self, setpoint, system_id, component_id, now_ns):
         self.setpoints.append((setpoint, system_id, component_id, now_ns))
@@ -84,6 +92,9 @@ class ScriptedHandler:
 
     def on_engage_request(self, request, now_ns):
         self.requests.append(request)
+
+    def on_rivals(self, sources, now_ns):
+        self.rivals.append(sources)
 
     def on_telemetry(self, message, now_ns):
         self.telemetry.append(message)
@@ -184,21 +195,76 @@ def test_a_value_that_is_used_and_not_finite_never_leaves(message):
 
 
 @pytest.mark.parametrize(
-    ("message", "kind", "detail"),
+    ("message", "kind"),
     [
-        (setpoint_message(frame=9), "LOCAL_NED", "coordinate_frame 9"),
-        (setpoint_message(mask=3527, x=NAN, vx=1.0), "LOCAL_NED", "velocity only"),
-        (setpoint_message(mask=3576 | 4), "LOCAL_NED", "partial position"),
-        (global_int(), "GLOBAL_INT", "not handled"),
-        (attitude_target(), "ATTITUDE", "not handled"),
+        (setpoint_message(frame=9), "LOCAL_NED"),
+        (setpoint_message(mask=3527, x=NAN, vx=1.0), "LOCAL_NED"),
+        (global_int(), "GLOBAL_INT"),
     ],
 )
-def test_a_kind_that_is_not_handled_passes_untouched_and_is_announced(message, kind, detail):
+def test_what_the_handler_does_not_treat_passes_untouched_and_is_announced(message, kind):
     data = packed(message)
+    bench = Bench(Unprotected("of this kind"))
+    assert bench.through(data) == [data]
+    assert bench.handler.unprotected == [(kind, "of this kind")]
+    assert bench.counters.unprotected == {kind: 1}
+    assert (bench.counters.setpoints_in, bench.counters.forwarded) == (1, 1)
+
+
+def test_an_attitude_passes_untouched_and_is_announced_without_asking():
+    data = packed(attitude_target())
     bench = Bench(Drop("never asked"))
     assert bench.through(data) == [data]
-    assert bench.handler.unprotected == [(kind, detail)]
-    assert bench.counters.unprotected == {kind: 1}
+    assert bench.handler.unprotected == [("ATTITUDE", "not handled")]
+    assert (bench.counters.setpoints_in, bench.counters.forwarded) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("message", "verdict", "field", "value"),
+    [
+        (setpoint_message(mask=3527, vx=1.0), RewriteVelocity(0.5, -0.25, 1.0, "substituted"), "vx", 0.5),
+        (setpoint_message(frame=9), RewriteOffset(0.5, -0.25, 0.0, 1.0, "held"), "z", 0.0),
+        (global_int(), RewriteGlobal(7, -9, 1.0, "turned"), "lon_int", -9),
+    ],
+)
+def test_every_kind_of_replacement_is_carried_out_and_counted(message, verdict, field, value):
+    bench = Bench(verdict)
+    (out,) = bench.through(packed(message))
+    (parsed,) = common.MAVLink(None).parse_buffer(bytearray(out))
+    assert getattr(parsed, field) == value
+    assert bench.counters.rewritten == {verdict.action: 1}
+    assert bench.counters.setpoints_in == 1
+
+
+def test_a_global_setpoint_is_sanitised_like_a_local_one():
+    bench = Bench()
+    message = global_int(alt=5.0)
+    message.vx, message.yaw = NAN, math.inf
+    (out,) = bench.through(packed(message))
+    (parsed,) = common.MAVLink(None).parse_buffer(bytearray(out))
+    assert (parsed.lat_int, parsed.lon_int, parsed.alt, parsed.vx, parsed.yaw) == (1, 2, 5.0, 0.0, 0.0)
+
+
+def test_rivals_are_told_to_the_handler_whatever_they_send():
+    bench = Bench()
+    for i in range(6):
+        sender = (PLANNER, common.MAVLink(None, 245, 190))[i % 2]
+        message = setpoint_message() if i % 2 else attitude_target()
+        bench.now_ns += 50_000_000
+        bench.through(packed(message, sender))
+    assert bench.handler.rivals == [((245, 190), (255, 190))]
+    assert bench.counters.as_dict()["rivalries"] == 1
+
+
+def test_senders_for_another_system_are_no_rivals():
+    bench = Bench()
+    bench.autopilot.receive(PX4_HEARTBEAT)
+    for i in range(6):
+        bench.now_ns += 50_000_000
+        bench.through(
+            packed(setpoint_message(target=(1 + i % 2, 1)), (PLANNER, common.MAVLink(None, 245, 190))[i % 2])
+        )
+    assert bench.handler.rivals == []
 
 
 def test_a_signed_setpoint_passes_untouched_with_an_alarm():
@@ -320,6 +386,9 @@ class SubstituteAll:
         pass
 
     def on_engage_request(self, request, now_ns):
+        pass
+
+    def on_rivals(self, sources, now_ns):
         pass
 
     def on_telemetry(self, message, now_ns):

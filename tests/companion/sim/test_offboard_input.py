@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from companion.guidance.setpoint import LocalSetpoint
+from companion.guidance.setpoint import GlobalSetpoint, LocalSetpoint
 from companion.sim.offboard_input import Refusal, interpret
 from companion.sim.vehicle import Target
 
@@ -57,6 +57,31 @@ def test_a_position_is_refused_in_every_frame_but_local_ned(frame: int) -> None:
     answer = taken(coordinate_frame=frame)
     assert isinstance(answer, Refusal)
     assert str(frame) in answer.reason
+
+
+def test_a_position_beside_a_body_velocity_is_not_read() -> None:
+    answer = taken(coordinate_frame=8, type_mask=3520)
+    assert answer == Target((None, None, None), (0.4, 0.5, 0.6))
+    assert isinstance(taken(coordinate_frame=8, type_mask=3527 | 8), Refusal)
+
+
+@pytest.mark.parametrize(("frame", "alt", "down_m"), [(5, 491.0, -3.0), (6, 3.0, -2.0), (11, 3.0, -2.0)])
+def test_a_global_position_is_one_in_local_ned(frame: int, alt: float, down_m: float) -> None:
+    lat, lon = 473977420, 85455940
+    setpoint = GlobalSetpoint(0, lat + 898, lon, alt, 9, 9, 9, 0, 0, 0, 0.7, 0, 2552, 1, 1, frame)
+    answer = interpret(setpoint, 0.0, system_id=1, component_id=1, home_down_m=1.0)
+    assert isinstance(answer, Target)
+    assert answer.position_ned_m == pytest.approx((10.0, 0.0, down_m), abs=0.01)
+    assert answer.velocity_ned_m_s == (0.0, 0.0, 0.0)
+
+
+def test_a_part_of_a_global_position_is_none_and_its_velocity_counts() -> None:
+    setpoint = GlobalSetpoint(0, 1, 2, 3.0, 0.4, 0.5, 0.6, 0, 0, 0, 0, 0, 3520 | 4, 1, 1, 6)
+    assert interpret(setpoint, 0.9, system_id=1, component_id=1) == Target(
+        (None, None, None), (0.4, 0.5, 0.6)
+    )
+    other = dataclasses.replace(setpoint, type_mask=3576, coordinate_frame=3)
+    assert isinstance(interpret(other, 0.0, system_id=1, component_id=1), Refusal)
 
 
 def test_a_body_velocity_is_turned_by_the_heading() -> None:

@@ -21,3 +21,13 @@ class LinkError(CompanionError):
 
 class WorkerError(CompanionError):
     """The vision worker cannot be started."""
+
+
+def first_of(group: BaseExceptionGroup[CompanionError]) -> CompanionError:
+    """Return the first error of a group, or of a group of groups, as a TaskGroup raises them."""
+    error: BaseException = group
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    if not isinstance(error, CompanionError):
+        raise error
+    return error

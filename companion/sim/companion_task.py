@@ -17,7 +17,7 @@ from structlog.typing import EventDict, WrappedLogger
 
 from companion.clock import Clock
 from companion.config import Config
-from companion.errors import CompanionError, ConfigError
+from companion.errors import CompanionError, ConfigError, first_of
 from companion.frames.source import FrameSource
 from companion.log import Log
 from companion.mavlink.link import UdpEndpoint
@@ -127,21 +127,13 @@ class CompanionTask:
         try:
             await task
         except* CompanionError as group:
-            raise _first(group) from group
+            raise first_of(group) from group
 
     def _take(self, event: Event) -> None:
         self.events.append(event)
         self._news.set()
         if self._on_event is not None:
             self._on_event(event)
-
-
-def _first(group: BaseExceptionGroup[CompanionError]) -> CompanionError:
-    """Return the first error of a group of groups."""
-    error: BaseException = group
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    return cast("CompanionError", error)
 
 
 def _event_log(level: str, take: Callable[[Event], None]) -> Log:

@@ -35,6 +35,7 @@ from companion.mavlink.telemetry import (
     MAV_AUTOPILOT_PX4,
     Attitude,
     AttitudeQuaternion,
+    CurrentMode,
     ExtendedSysState,
     GlobalOrigin,
     GlobalPosition,
@@ -44,11 +45,13 @@ from companion.mavlink.telemetry import (
     Telemetry,
     Unusable,
     VehicleMode,
+    is_offboard,
     vehicle_mode,
 )
 from companion.run_statistics import RunStatistics
 
 _HEARTBEAT_LOST_NS: Final = 3_500_000_000
+_NEVER_NS: Final = -(1 << 62)
 _AUTOPILOTS: Final = {
     MAV_AUTOPILOT_PX4: Autopilot.PX4,
     MAV_AUTOPILOT_ARDUPILOTMEGA: Autopilot.ARDUPILOT,
@@ -91,8 +94,8 @@ class Interception:
         self._autopilot_heartbeat_ns: int | None = None
         self._heartbeat_lost = False
         self._mode = VehicleMode(armed=False, offboard=False)
-        self._asked_to_arm_ns = -(1 << 62)
-        self._asked_for_offboard_ns = -(1 << 62)
+        self._asked_to_arm_ns = _NEVER_NS
+        self._asked_for_offboard_ns = _NEVER_NS
         self._was_ready = False
         self._report_waiting: DetectionReport | None = None
         self._last_report: DetectionReport | None = None
@@ -216,6 +219,8 @@ class Interception:
                 self._reset_counter = message.reset_counter
             case Heartbeat():
                 self._on_heartbeat(message, now_ns)
+            case CurrentMode():
+                self._on_current_mode(message, now_ns)
             case Unusable():
                 if (message.message_id, message.reason) not in self._unusable:
                     self._unusable.add((message.message_id, message.reason))
@@ -232,8 +237,23 @@ class Interception:
         self._mode = vehicle_mode(heartbeat)
         self._tell_mode(now_ns)
 
+    def _on_current_mode(self, message: CurrentMode, now_ns: int) -> None:
+        """Take the mode from the faster message: a switch on the remote control is then known at once."""
+        vehicle = self._identity.vehicle
+        if vehicle is None:  # what the number means depends on the kind of autopilot
+            return
+        self._mode = self._mode._replace(offboard=is_offboard(vehicle, message.custom_mode))
+        self._tell_mode(now_ns)
+
     def _tell_mode(self, now_ns: int) -> None:
-        """Tell the mode of the last HEARTBEAT, ahead of it what was just asked for."""
+        """Tell the mode that the autopilot last named, ahead of it what was just asked for.
+
+        A request counts until the autopilot has carried it out: what it says after that is the pilot's doing.
+        """
+        if self._mode.armed:
+            self._asked_to_arm_ns = _NEVER_NS
+        if self._mode.offboard:
+            self._asked_for_offboard_ns = _NEVER_NS
         armed = self._mode.armed or now_ns - self._asked_to_arm_ns <= _REQUEST_COUNTS_NS
         offboard = self._mode.offboard or now_ns - self._asked_for_offboard_ns <= _REQUEST_COUNTS_NS
         self.switch.on_vehicle(armed=armed, offboard=offboard, now_ns=now_ns)

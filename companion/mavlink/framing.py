@@ -37,8 +37,13 @@ SIGNATURE_BYTES: Final = 13
 INCOMPAT_SIGNED: Final = 0x01
 MAX_FRAME_BYTES: Final = HEADER_V2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 
+CURRENT_MODE: Final = 436
+_NOT_IN_DIALECT: Final = {CURRENT_MODE: 193}
+"""Messages that are read here and that pymavlink 2.4.50's dialect lacks, with their CRC_EXTRA."""
+
 _CRC_EXTRA: Final[dict[int, bytes]] = {
-    message_id: bytes([message.crc_extra]) for message_id, message in mavlink_map.items()
+    **{message_id: bytes([message.crc_extra]) for message_id, message in mavlink_map.items()},
+    **{message_id: bytes([extra]) for message_id, extra in _NOT_IN_DIALECT.items()},
 }
 _MAGIC: Final = re.compile(rb"[\xfd\xfe]")
 

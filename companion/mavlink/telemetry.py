@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from companion.mavlink.framing import RawFrame
+from companion.mavlink.framing import CURRENT_MODE, RawFrame
 
 MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
 MAV_AUTOPILOT_INVALID: Final = 8
@@ -37,6 +37,16 @@ class Heartbeat:
     base_mode: int
     custom_mode: int
     system_status: int
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentMode:
+    """CURRENT_MODE: the mode alone, at up to 50 Hz where it is asked for; PX4 sends it every 2 s by itself.
+
+    https://mavlink.io/en/messages/common.html#CURRENT_MODE
+    """
+
+    custom_mode: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +129,7 @@ class Unusable:
 
 Telemetry = (
     Heartbeat
+    | CurrentMode
     | Attitude
     | AttitudeQuaternion
     | LocalPosition
@@ -137,6 +148,7 @@ class VehicleMode(NamedTuple):
 
 
 _HEARTBEAT: Final = struct.Struct("<IBBBBB")
+_CUSTOM_MODE: Final = struct.Struct("<I")
 _SIX_FLOATS: Final = struct.Struct("<I6f")
 _QUATERNION: Final = struct.Struct("<I7f")
 _GLOBAL_POSITION: Final = struct.Struct("<Iii")
@@ -184,6 +196,10 @@ def is_offboard(vehicle: Heartbeat, custom_mode: int) -> bool:
 def _heartbeat(frame: RawFrame) -> Heartbeat:
     custom_mode, kind, autopilot, base_mode, status = _HEARTBEAT.unpack_from(_padded(frame, 9))[:5]
     return Heartbeat(frame.system_id, frame.component_id, kind, autopilot, base_mode, custom_mode, status)
+
+
+def _current_mode(frame: RawFrame) -> CurrentMode:
+    return CurrentMode(_CUSTOM_MODE.unpack_from(_padded(frame, _CUSTOM_MODE.size))[0])
 
 
 def _attitude(frame: RawFrame) -> Attitude | Unusable:
@@ -252,6 +268,7 @@ _READERS: Final[dict[int, Callable[[RawFrame], Telemetry | Unusable]]] = {
     49: _global_origin,
     245: _extended_sys_state,
     331: _odometry,
+    CURRENT_MODE: _current_mode,
 }
 
 MESSAGE_IDS: Final = frozenset(_READERS)

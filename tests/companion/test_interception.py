@@ -28,6 +28,7 @@ from companion.mavlink.requests import EngageRequest
 from companion.mavlink.telemetry import (
     Attitude,
     AttitudeQuaternion,
+    CurrentMode,
     GlobalOrigin,
     GlobalPosition,
     Heartbeat,
@@ -363,6 +364,43 @@ def test_a_request_that_was_refused_counts_for_a_second_and_a_half():
     bench.heartbeat(mode=HOLD_MODE, armed=False)
     assert bench.switch.state is State.DISENGAGED
     assert isinstance(bench.flight.on_setpoint(setpoint(5, 0), 245, 190, bench.now), Forward)
+
+
+def test_a_mode_changed_by_the_pilots_switch_is_known_with_the_next_current_mode():
+    bench = flying()
+    bench.ask()
+    bench.flight.on_telemetry(CurrentMode(3 << 16), bench.now)
+    assert (bench.switch.state, bench.switch.reason) == (State.DISENGAGED, "not in OFFBOARD")
+    bench.flight.on_telemetry(CurrentMode(OFFBOARD), bench.now)
+    bench.report()
+    assert isinstance(bench.ask(), Rewrite)
+    bench.flight.on_telemetry(CurrentMode(4), bench.now)  # GUIDED of a copter, which this is not
+    assert bench.ask() == Forward()
+
+
+def test_current_mode_says_nothing_of_arming_and_nothing_before_the_first_heartbeat():
+    bench = Bench()
+    bench.telemetry()
+    bench.flight.on_telemetry(CurrentMode(3 << 16), bench.now)
+    assert bench.ask().action == "held", "the mode is not known yet"
+    bench.heartbeat(mode=HOLD_MODE, armed=False)
+    bench.flight.on_telemetry(CurrentMode(OFFBOARD), bench.now)
+    assert (bench.ask(), bench.switch.reason) == (Forward(), "disarmed")
+
+
+def test_the_pilot_wins_at_once_also_just_after_a_request_that_was_carried_out():
+    bench = Bench()
+    bench.heartbeat(mode=HOLD_MODE)
+    bench.telemetry(0.5)
+    bench.flight.on_engage_request(EngageRequest(arm=False, offboard=True), bench.now)
+    bench.flight.on_telemetry(CurrentMode(HOLD_MODE), bench.now)  # was on its way
+    assert isinstance(bench.ask(), Rewrite)
+    bench.telemetry(0.1)
+    bench.flight.on_telemetry(CurrentMode(OFFBOARD), bench.now)
+    assert isinstance(bench.ask(), Rewrite)
+    bench.telemetry(0.1)
+    bench.flight.on_telemetry(CurrentMode(3 << 16), bench.now)
+    assert bench.ask() == Forward()
 
 
 # ---------------------------------------------------------------- kinds of setpoints, and whose

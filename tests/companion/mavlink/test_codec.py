@@ -286,6 +286,17 @@ def test_telemetry_reads_what_pymavlink_packed(a, b, c):
     assert position == telemetry.LocalPosition(77, a, b, c, c, b, a)
 
 
+@pytest.mark.parametrize(("custom_mode", "trimmed"), [(6 << 16, 7), (4, 1), (0, 1), (0xFFFFFFFF, 9)])
+def test_current_mode_is_read_and_checked_although_the_dialect_lacks_it(custom_mode, trimmed):
+    payload = struct.pack("<IIB", custom_mode, custom_mode, 0)[:trimmed]
+    covered = bytes([len(payload), 0, 0, 9, 1, 1]) + (436).to_bytes(3, "little") + payload
+    crc = common.x25crc(covered + bytes([193])).crc.to_bytes(2, "little")
+    (frame,) = Framer().feed(b"\xfd" + covered + crc)
+    assert frame.verified
+    assert telemetry.decode(frame) == telemetry.CurrentMode(custom_mode & (1 << 8 * trimmed) - 1)
+    assert Framer().feed(b"\xfd" + covered + bytes([crc[0] ^ 1, crc[1]])) == []
+
+
 @RELAXED
 @given(st.tuples(*[st.floats(-1, 1)] * 4))
 def test_a_quaternion_is_normalised_or_refused(q):

@@ -51,7 +51,7 @@ def signed(data: bytes) -> bytes:
 
 def unknown_frame(rng: random.Random, seq: int, system: int, component: int) -> bytes:
     body = rng.randbytes(rng.randint(1, 80))
-    head = bytes([len(body), 0, 0, seq, system, component]) + (436).to_bytes(3, "little")
+    head = bytes([len(body), 0, 0, seq, system, component]) + (433).to_bytes(3, "little")
     return b"\xfd" + head + body + rng.randbytes(2)
 
 

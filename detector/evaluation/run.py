@@ -37,7 +37,7 @@ class Settings:
     Attributes
     ----------
     method
-        A name in :data:`detector.evaluation.methods.METHODS`.
+        A name in :data:`detector.evaluation.methods.METHODS`, or of a method made elsewhere.
     preset
         What the parameters started from.
     params
@@ -80,6 +80,7 @@ def evaluate(
     settings: Settings,
     read_image: ReadImage,
     *,
+    method: Method | None = None,
     on_step: Callable[[], None] | None = None,
     timer: Callable[[], float] = time.perf_counter,
 ) -> Evaluation:
@@ -95,6 +96,8 @@ def evaluate(
         What is evaluated.
     read_image
         Gives (H, W) uint8 of a file.
+    method
+        Made elsewhere, in place of the one that the settings name.
     on_step
         Called after each of the :func:`count_steps` steps.
     timer
@@ -109,7 +112,8 @@ def evaluate(
         for pair in pairs:
             if pair.b_derot is None:
                 raise DatasetError(f"{images.folder}: the pair of {pair.a} and {pair.b} has no b_derot")
-    method = METHODS[settings.method](settings.params)
+    if method is None:
+        method = METHODS[settings.method](settings.params)
     reader = _Reader(images, read_image)
     verdicts: list[Verdict] = []
     for pair in pairs:

@@ -1,14 +1,12 @@
 """A method run over a set: what it is told, which pairs count, and how verdicts add up."""
 
 from pathlib import Path
-from types import MappingProxyType
 
 import cv2
 import numpy as np
 import pytest
 
 from detector.camera_model import CameraModel
-from detector.evaluation import run
 from detector.evaluation.dataset import (
     DatasetError,
     Depth,
@@ -50,16 +48,6 @@ class Told:
         self.resets += 1
 
 
-@pytest.fixture
-def told(monkeypatch):
-    def using(*answers):
-        method = Told(answers)
-        monkeypatch.setattr(run, "METHODS", MappingProxyType({"told": lambda params: method}))
-        return method
-
-    return using
-
-
 def images_of(frames, pairs=(), camera=None):
     return ImageSet("made", Path("made"), (64, 48), camera, frames, tuple(pairs))
 
@@ -81,7 +69,7 @@ def moving():
     return images_of(frames, [Pair(a="a", b="b", b_derot="turned")], CAMERA)
 
 
-def test_what_a_method_is_told_of_the_motion(told):
+def test_what_a_method_is_told_of_the_motion():
     images = moving()
     motion = images.motion_of(images.pairs[0])
     assert isinstance(motion, Motion)
@@ -92,8 +80,8 @@ def test_what_a_method_is_told_of_the_motion(told):
         ("full", True, np.eye(3), motion.translation_earlier_m),
         ("none", True, None, None),
     ):
-        method = told(direction(5.0))
-        done = evaluate(images, images.pairs, settings(poses=poses, derotated=derotated), read)
+        method = Told([direction(5.0)])
+        done = evaluate(images, images.pairs, settings(poses=poses, derotated=derotated), read, method=method)
         given = method.given[0]
         np.testing.assert_equal(given.later_from_earlier, rotation)
         np.testing.assert_equal(given.translation_earlier_m, translation)
@@ -105,24 +93,24 @@ def test_what_a_method_is_told_of_the_motion(told):
         assert said["per_pair"][0]["baseline_m"] == pytest.approx(0.5)
 
 
-def test_a_set_without_poses_tells_nothing_whatever_is_asked(told):
+def test_a_set_without_poses_tells_nothing_whatever_is_asked():
     images = images_of({"a": Frame(), "b": Frame()}, [Pair(a="a", b="b")], CAMERA)
-    method = told(direction(5.0))
-    done = evaluate(images, images.pairs, settings(), read)
+    method = Told([direction(5.0)])
+    done = evaluate(images, images.pairs, settings(), read, method=method)
     assert method.given[0].later_from_earlier is None
     assert summary(done)["poses"] == "none"
 
 
-def test_every_pair_is_a_first_loop_unless_it_is_a_sequence(told):
+def test_every_pair_is_a_first_loop_unless_it_is_a_sequence():
     images = images_of({"a": Frame(), "b": Frame()}, [Pair(a="a", b="b")] * 3)
     for sequence, resets in ((False, 3), (True, 0)):
-        method = told(*[Answer("none", reason="no_motion")] * 3)
-        done = evaluate(images, images.pairs, settings(sequence=sequence), read)
+        method = Told([Answer("none", reason="no_motion")] * 3)
+        done = evaluate(images, images.pairs, settings(sequence=sequence), read, method=method)
         assert method.resets == resets
         assert summary(done)["loops"] == ("sequence" if sequence else "first")
 
 
-def test_figures_add_up(told):
+def test_figures_add_up():
     open_ = {"depth": Depth(column_profile_m=(1.0, 4.0), plane_like=False)}
     wall = {"depth": Depth(column_profile_m=(4.0, 4.0), plane_like=True)}
     frames = {
@@ -138,10 +126,10 @@ def test_figures_add_up(told):
         direction(10.0), Answer("single_plane"), Answer("none", reason="no_motion"),
         direction(1.0), Answer("none", reason="no_motion"), direction(2.0),
     ]  # fmt: skip
-    told(*method_says)
+    method = Told(method_says)
     images = images_of(frames, [Pair(a="a", b=name) for name in names])
     ticks = iter(range(100))
-    done = evaluate(images, images.pairs, settings(), read, timer=lambda: float(next(ticks)))
+    done = evaluate(images, images.pairs, settings(), read, method=method, timer=lambda: float(next(ticks)))
     said = summary(done)
     assert said["pairs"] == 10
     assert said["kinds"] == {"lowest_flow": 5, "none": 3, "single_plane": 2}
@@ -163,12 +151,12 @@ def test_figures_add_up(told):
     assert said["per_pair"][3] == {**said["per_pair"][3], "kind": "none", "reason": "blurred", "right": None}
 
 
-def test_stills_are_judged_by_their_lines_alone(told):
+def test_stills_are_judged_by_their_lines_alone():
     frames = {"1": Frame(vp=(11.0, 10.0)), "2": Frame(), "3": Frame(vp=(40.0, 10.0))}
-    told()
+    method = Told([])
     images = images_of(frames)
     assert count_steps(images, ()) == 2
-    said = summary(evaluate(images, (), settings(), read))
+    said = summary(evaluate(images, (), settings(), read, method=method))
     assert said["pairs"] == 0
     lines = said["vanishing_point"]
     assert (lines["with_truth"], lines["found"], lines["within_tenth_width"]) == (2, 2, 1)
@@ -176,12 +164,14 @@ def test_stills_are_judged_by_their_lines_alone(told):
     assert said["direction"]["right_ci"] is None
 
 
-def test_lines_of_pairs_are_judged_on_each_later_frame_once(told):
+def test_lines_of_pairs_are_judged_on_each_later_frame_once():
     frames = {"a": Frame(vp=(1.0, 1.0)), "b": Frame(vp=(11.0, 10.0))}
-    told(*[Answer("none")] * 2)
+    method = Told([Answer("none")] * 2)
     images = images_of(frames, [Pair(a="a", b="b"), Pair(a="b", b="b")])
     steps = []
-    said = summary(evaluate(images, images.pairs, settings(), read, on_step=lambda: steps.append(1)))
+    said = summary(
+        evaluate(images, images.pairs, settings(), read, method=method, on_step=lambda: steps.append(1))
+    )
     assert [frame["frame"] for frame in said["per_frame"]] == ["b"]
     assert len(steps) == count_steps(images, images.pairs) == 3
 
@@ -196,13 +186,13 @@ def test_pairs_whose_depth_is_hardly_known_can_be_left_out():
     assert [pair.b for pair in enough_depth(images, images.pairs, 0.6)] == ["much", "a"]
 
 
-def test_images_of_another_size_and_missing_turned_images_are_refused(told):
+def test_images_of_another_size_and_missing_turned_images_are_refused():
     images = images_of({"a": Frame(), "b": Frame()}, [Pair(a="a", b="b")])
-    told(direction(1.0))
+    method = Told([direction(1.0)])
     with pytest.raises(DatasetError, match="found 20 x 10 px, image_size says 64 x 48"):
-        evaluate(images, images.pairs, settings(), lambda path: np.zeros((10, 20), np.uint8))
+        evaluate(images, images.pairs, settings(), lambda path: np.zeros((10, 20), np.uint8), method=method)
     with pytest.raises(DatasetError, match="has no b_derot"):
-        evaluate(images, images.pairs, settings(derotated=True), read)
+        evaluate(images, images.pairs, settings(derotated=True), read, method=method)
 
 
 def grey(path):

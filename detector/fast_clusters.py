@@ -17,7 +17,7 @@ from detector.clusters import Clustering
 
 _MOST_ITERATIONS: Final = 100
 """OpenCV's own limit."""
-_SETTLED: Final = 1e-3
+_SETTLED: Final = 0.1
 """A run ends when no centre moves by more than this (px, or degrees)."""
 
 

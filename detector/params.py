@@ -60,7 +60,7 @@ class DetectorParams(BaseModel):
     ] = 4
     fast_restarts: Annotated[
         int, Field(ge=1, le=100, description="fast: k-means runs for each n in the first loop.")
-    ] = 4
+    ] = 6
 
     # ------------------------------------------------------------------ frames
     min_width_px: Annotated[

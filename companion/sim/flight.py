@@ -18,6 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
+
 from companion.errors import CompanionError
 from companion.run_statistics import percentiles
 from companion.sim.estimate_errors import EstimateErrors
@@ -65,7 +67,7 @@ class FlightSpec:
     planner_hz
         Setpoints a second.
     time_limit_s
-        After which a flight is a ``timeout``; None: one minute and eight seconds for each metre of straight line.
+        After which a flight is a ``timeout``; None: as the world has it.
     estimate
         Errors of the autopilot's estimate.
     """
@@ -111,8 +113,7 @@ class FlightSpec:
 
     def rules_for(self, place: Place) -> Rules:
         """Return when a flight there ends."""
-        default_s = 60.0 + 8.0 * place.straight_m
-        return Rules(time_limit_s=default_s if self.time_limit_s is None else self.time_limit_s)
+        return Rules(place.time_limit_s if self.time_limit_s is None else self.time_limit_s)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, for JSON."""
@@ -267,9 +268,8 @@ def free_ratios(spec: FlightSpec, place: Place, record: FlightRecord) -> list[fl
     """Return, for each direction answered, the free distance along it over the greatest in the field of view."""
     # Azimuth of a column, with the camera level: a pinhole with the principal point in the middle.
     focal_px = spec.width_px / 2.0 / math.tan(math.radians(spec.hfov_deg) / 2.0)
-    half_rad = math.radians(spec.hfov_deg) / 2.0
-    steps = math.floor(half_rad / _SECTOR_STEP_RAD)
-    sector_rad = [step * _SECTOR_STEP_RAD for step in range(-steps, steps + 1)]
+    steps = math.floor(math.radians(spec.hfov_deg) / 2.0 / _SECTOR_STEP_RAD)
+    sector_rad = _SECTOR_STEP_RAD * np.arange(-steps, steps + 1)
     ratios: list[float] = []
     for kind, frame_s, (x_px, _) in zip(
         record.answer_kind.tolist(),
@@ -282,10 +282,8 @@ def free_ratios(spec: FlightSpec, place: Place, record: FlightRecord) -> list[fl
         sample = record.sample_at(frame_s)
         north, east, down = record.position_ned_m[sample].tolist()
         position: Vector3 = (north, east, down)
-        heading_rad = float(record.heading_rad[sample])
         chosen_rad = math.atan((x_px - (spec.width_px - 1) / 2.0) / focal_px)
-        chosen_m = place.free_distance_m(position, heading_rad + chosen_rad)
-        best_m = max(place.free_distance_m(position, heading_rad + offset) for offset in sector_rad)
-        best_m = max(best_m, chosen_m)
-        ratios.append(chosen_m / best_m if best_m > 0.0 else 1.0)
+        azimuths_rad = record.heading_rad[sample] + np.append(sector_rad, chosen_rad)
+        free_m = place.free_distances_m(position, azimuths_rad)
+        ratios.append(float(free_m[-1] / free_m.max()) if free_m.max() > 0.0 else 1.0)
     return ratios

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from companion.sim.camera_feed import Renderer
 from companion.sim.vehicle import Vector3
@@ -26,8 +28,11 @@ class Place:
         Makes what the camera looks at; picklable, because the camera may be another process.
     clearance_m
         From the vehicle's hull at a position to the nearest thing, m; 0 or less where it touches.
-    free_distance_m
-        How far the vehicle could go from a position along an azimuth (rad) before it touches something, m.
+    free_distances_m
+        How far the vehicle could go from a position along azimuths (rad, shape (k,)) before it touches something:
+        (k,), m.
+    time_limit_s
+        Then a flight is over, where nobody says otherwise.
     """
 
     name: str
@@ -36,9 +41,5 @@ class Place:
     goal_ned_m: Vector3
     renderer: Callable[[], Renderer]
     clearance_m: Callable[[Vector3], float]
-    free_distance_m: Callable[[Vector3, float], float]
-
-    @property
-    def straight_m(self) -> float:
-        """Distance from start to goal."""
-        return math.dist(self.start_ned_m, self.goal_ned_m)
+    free_distances_m: Callable[[Vector3, NDArray[np.float64]], NDArray[np.float64]]
+    time_limit_s: float = 120.0

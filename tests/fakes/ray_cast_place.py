@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
+
 from companion.sim.flight_place import Place
 from companion.sim.scene import Scene
 from companion.sim.vehicle import Vector3
@@ -37,5 +39,7 @@ def ray_cast_place(
         goal_ned_m=(goal_north_m, 0.0, down_m),
         renderer=scene,
         clearance_m=clearance_m,
-        free_distance_m=free_distance_m,
+        free_distances_m=lambda position, azimuths_rad: np.array(
+            [free_distance_m(position, azimuth_rad) for azimuth_rad in azimuths_rad]
+        ),
     )

@@ -145,7 +145,7 @@ def test_free_ratio_is_one_along_the_free_way_and_small_toward_a_wall():
         "answer_distance_m": np.full(2, np.nan),
     }
     offsets = np.radians(np.arange(-36, 37, 3))
-    free_m = [WALLED.free_distance_m(WALLED.start_ned_m, float(o)) for o in offsets]
+    free_m = WALLED.free_distances_m(WALLED.start_ned_m, offsets)
     focal_px = 160.0 / math.tan(math.radians(37.5))
     best_px = 159.5 + focal_px * math.tan(offsets[int(np.argmax(free_m))])
     worst_px = 159.5 + focal_px * math.tan(offsets[int(np.argmin(free_m))])

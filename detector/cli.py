@@ -7,6 +7,7 @@ Each command is a module of :mod:`detector.commands`. OpenCV and the detector it
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import Final
@@ -14,6 +15,8 @@ from typing import Final
 from detector.commands import detect, evaluate, report, video
 from detector.commands.inputs import InputError
 
+EXIT_NO_READER: Final = 1
+"""Nobody reads what is printed any more."""
 EXIT_BAD_INPUT: Final = 2
 """The command line, or a file that it names, cannot be used (also argparse's own code)."""
 
@@ -34,9 +37,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     try:
         code: int = options.run(options)
+        sys.stdout.flush()
     except InputError as error:
         print(f"detector: error: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
+    except (
+        BrokenPipeError
+    ):  # the reader (head, less) has seen enough; nothing more can be written, at exit neither
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_NO_READER
     return code
 
 

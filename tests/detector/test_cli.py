@@ -179,3 +179,11 @@ def test_a_baseline_that_is_no_distance_is_refused(capsys, baseline):
 def test_help_does_not_import_opencv():
     code = "import sys, detector.cli; sys.exit('cv2' in sys.modules or 'sklearn' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    code = f"import sys; from detector.cli import main; sys.exit(main(['detect', *{OFFICE!r}, '--json']))"
+    command = f'{sys.executable} -c "{code}" | true; echo "${{PIPESTATUS[0]}}"'
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
+    assert done.stderr == ""
+    assert done.stdout.strip() == "1"

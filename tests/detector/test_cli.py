@@ -184,6 +184,6 @@ def test_help_does_not_import_opencv():
 def test_a_reader_that_has_seen_enough_is_no_error():
     code = f"import sys; from detector.cli import main; sys.exit(main(['detect', *{OFFICE!r}, '--json']))"
     command = f'{sys.executable} -c "{code}" | true; echo "${{PIPESTATUS[0]}}"'
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(["/bin/bash", "-c", command], capture_output=True, text=True, timeout=60)
     assert done.stderr == ""
     assert done.stdout.strip() == "1"

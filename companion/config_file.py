@@ -43,7 +43,7 @@ def load_config(path: str | Path) -> Config:
         With every fault of the file, one a line.
     """
     path = Path(path)
-    return _resolve_paths(parse_config(_read_text(path), name=str(path)), path.absolute().parent)
+    return _resolve_paths(parse_config(read_text(path), name=str(path)), path.absolute().parent)
 
 
 def parse_config(text: str, *, name: str = "configuration") -> Config:
@@ -54,12 +54,7 @@ def parse_config(text: str, *, name: str = "configuration") -> Config:
     companion.errors.ConfigError
         With every fault of the text, one a line.
     """
-    try:
-        table = tomllib.loads(text)
-    except ValueError as error:  # TOMLDecodeError is one; a number of thousands of digits raises a bare one
-        raise ConfigError(f"{name}: not valid TOML: {error}") from error
-    except RecursionError as error:
-        raise ConfigError(f"{name}: not valid TOML: nested too deeply") from error
+    table = parse_table(text, name=name)
     try:
         return Config.model_validate(table)
     except ValidationError as error:
@@ -77,7 +72,7 @@ def default_toml() -> str:
         parts.append(f"\n{_comment(schema['description'])}[{section}]\n")
         for key, facts in schema["properties"].items():
             default = _toml(facts["default"])
-            allowed = _allowed(facts)
+            allowed = allowed_values(facts)
             parts.append(
                 f"\n{_comment(facts['description'])}"
                 f"{_comment(f'Allowed: {allowed}. Default: {default}')}"
@@ -86,7 +81,14 @@ def default_toml() -> str:
     return "".join(parts)
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path, *, noun: str = "configuration") -> str:
+    """Read a small text file that a user names; ``noun`` says in messages what it ought to be.
+
+    Raises
+    ------
+    companion.errors.ConfigError
+        When it cannot be read, is too large or is not text.
+    """
     try:
         with path.open("rb") as file:
             # One byte more than allowed, and never the whole of an endless device.
@@ -94,17 +96,33 @@ def _read_text(path: Path) -> str:
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
     except IsADirectoryError as error:
-        raise ConfigError(f"{path}: is a folder; give the configuration file itself") from error
+        raise ConfigError(f"{path}: is a folder; give the {noun} file itself") from error
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise ConfigError(f"{path}: cannot be read: {reason}") from error
     if len(data) > _MAX_FILE_BYTES:
-        raise ConfigError(f"{path}: larger than {_MAX_FILE_BYTES} bytes, which no configuration is")
+        raise ConfigError(f"{path}: larger than {_MAX_FILE_BYTES} bytes, which no {noun} is")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise ConfigError(f"{path}: not UTF-8 text: byte 0x{data[error.start]:02x} in line {line}") from error
+
+
+def parse_table(text: str, *, name: str) -> dict[str, Any]:
+    """Parse TOML text; ``name`` stands in messages for the file.
+
+    Raises
+    ------
+    companion.errors.ConfigError
+        When it is not TOML.
+    """
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # TOMLDecodeError is one; a number of thousands of digits raises a bare one
+        raise ConfigError(f"{name}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{name}: not valid TOML: nested too deeply") from error
 
 
 def _resolve_paths(config: Config, folder: Path) -> Config:
@@ -139,13 +157,13 @@ def _fault_lines(details: ErrorDetails, table: Mapping[str, Any]) -> list[str]:
         ]
     if details["type"] == "extra_forbidden":
         return [_unknown_key_line(loc, table)]
-    found = f"{_dotted(loc)}: found {_shown(details['input'])}"
+    found = f"{_dotted(loc)}: found {shown_value(details['input'])}"
     schemas = _section_schemas()
     if len(loc) == 1:
         return [f"{found}; allowed: a table, [{loc[0]}]"]
     if isinstance(raised, ValueError):
         return [f"{found}; allowed: {raised}"]
-    return [f"{found}; allowed: {_allowed(schemas[loc[0]]['properties'][loc[1]])}"]
+    return [f"{found}; allowed: {allowed_values(schemas[loc[0]]['properties'][loc[1]])}"]
 
 
 def _unknown_key_line(loc: tuple[str, ...], table: Mapping[str, Any]) -> str:
@@ -165,8 +183,8 @@ def _unknown_key_line(loc: tuple[str, ...], table: Mapping[str, Any]) -> str:
     return f"{line}; allowed here: {', '.join(known)}"
 
 
-def _allowed(facts: Mapping[str, Any]) -> str:
-    """Return what a key may hold, in words, from its JSON schema."""
+def allowed_values(facts: Mapping[str, Any]) -> str:
+    """Return what a key may hold, in words, from its JSON schema (one without references)."""
     if "const" in facts:
         return f"only {_toml(facts['const'])}"
     if "enum" in facts:
@@ -195,7 +213,8 @@ def _dotted(loc: Sequence[str]) -> str:
     return ".".join(part if _BARE_KEY.fullmatch(part) else json.dumps(part)[:_MAX_SHOWN] for part in loc)
 
 
-def _shown(value: object) -> str:
+def shown_value(value: object) -> str:
+    """Return what was found in a file, in short, for a message."""
     if isinstance(value, dict):
         return "a table"
     if isinstance(value, list):

@@ -52,9 +52,10 @@ def samples_of(end_px: NDArray[np.float64], angles_deg: NDArray[np.float64]) -> 
 
 def seeded_starts(seed: int, restarts: int) -> Starts:
     """Return k-means++ starts drawn from ``seed``: the same samples and n always give the same starts."""
-    from sklearn.cluster import kmeans_plusplus
 
     def starts(samples: NDArray[np.float64], n: int) -> list[NDArray[np.float64]]:
+        from sklearn.cluster import kmeans_plusplus
+
         random = np.random.RandomState([seed % (1 << 32), n])
         return [
             np.asarray(kmeans_plusplus(samples, n, random_state=random)[0], np.float64)

@@ -1,6 +1,9 @@
 """k-means and indices at flight rate agree with scikit-learn's."""
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,3 +77,11 @@ def test_quality_where_the_indices_are_not_defined() -> None:
 def test_fewer_samples_than_clusters_is_an_error() -> None:
     with pytest.raises(ValueError, match="as many samples as clusters, got 3, 4"):
         fast_clusters.kmeans(np.zeros((3, 3)), 4, seed=0, attempts=1)
+
+
+def test_the_fast_path_never_loads_scikit_learn() -> None:
+    pairs = Path(__file__).parents[1] / "data" / "pairs" / "office"
+    images = [str(pairs / name) for name in ("00068.jpg", "00069.jpg")]
+    code = f"import sys; from detector.cli import main; main(['detect', *{images!r}]); sys.exit('sklearn' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr

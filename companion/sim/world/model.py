@@ -83,8 +83,12 @@ class Wall(_Thing):
         None
     )
     texture: Texture = "drywall_1"
-    openings: Annotated[tuple[Opening, ...], Field(strict=False, description="Doorways in it.")] = ()
-    pictures: Annotated[tuple[Picture, ...], Field(strict=False, description="Flat on it.")] = ()
+    openings: Annotated[
+        tuple[Opening, ...], Field(strict=False, max_length=500, description="Doorways in it.")
+    ] = ()
+    pictures: Annotated[
+        tuple[Picture, ...], Field(strict=False, max_length=500, description="Flat on it.")
+    ] = ()
 
     @property
     def length_m(self) -> float:

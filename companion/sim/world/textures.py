@@ -44,6 +44,7 @@ TILE_SIDE_M: Final[Mapping[str, float]] = MappingProxyType(
         "floor_tiles_white": 1.0,
         "grass_1": 2.0,
         "grass_2": 2.0,
+        "logo_mila_1": 2.0,
         "marble_1": 1.0,
         "marble_2": 1.0,
         "metal_grill_1": 1.0,

@@ -4,6 +4,7 @@ from typing import get_args
 
 import pytest
 
+from companion.sim.world.file import builtin_worlds, load_world
 from companion.sim.world.furniture import MESHES, FurnitureKind
 from companion.sim.world.textures import TILE_SIDE_M, plain_colour_rgb, texture_file
 
@@ -53,3 +54,14 @@ def test_a_plain_colour_has_no_file() -> None:
     assert texture_file("plain:#0a10ff") is None
     assert plain_colour_rgb("plain:#0a10ff") == (10, 16, 255)
     assert plain_colour_rgb("wood_1") is None
+
+
+@pytest.mark.parametrize("name", builtin_worlds())
+def test_every_picture_of_a_built_in_world_is_in_the_wheel(name: str) -> None:
+    folder = _wheel() / "textures"
+    world = load_world(name)
+    used = {world.floor_texture, world.ceiling_texture}
+    used |= {thing.texture for thing in (*world.walls, *world.boxes, *world.pillars)}
+    used |= {picture.texture for wall in world.walls for picture in wall.pictures}
+    files = [file for texture in sorted(used) if (file := texture_file(texture)) is not None]
+    assert [file for file in files if not (folder / file).is_file()] == []

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from detector.commands import detect, evaluate, report, video
+from detector.commands import bench, detect, evaluate, report, video
 from detector.commands.inputs import InputError
 
 EXIT_NO_READER: Final = 1
@@ -55,6 +55,6 @@ def _parser() -> argparse.ArgumentParser:
         description="Void detection for indoor drones, from optical flow and vanishing points of one camera.",
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (detect, evaluate, report, video):
+    for command in (detect, evaluate, report, video, bench):
         command.add(commands)
     return parser

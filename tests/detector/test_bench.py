@@ -1,0 +1,196 @@
+"""The benchmark measures what it says, on frames that are what it says. No assertion on speed."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from detector import bench
+from detector.bench_frames import generated_stream, resized_stream, there_and_back
+from detector.bench_memory import peak_memory
+from detector.cli import main
+from detector.commands.bench import longest_run, table_of
+from detector.drawing.performance import performance_chart
+from detector.params import DetectorParams
+from detector.two_view import reconstruct
+
+OFFICE = Path(__file__).parents[1] / "data" / "pairs" / "office"
+SMALL = (320, 240)
+PARAMS = DetectorParams.preset(
+    "default", kmeans_restarts=1, clusters_max=6, min_features=50, min_flow_vectors=50
+)
+
+
+@pytest.fixture(scope="module")
+def figures():
+    literal = bench.literal_reference()
+    assert literal is not None
+    return bench.run({SMALL: generated_stream(SMALL, 4)}, PARAMS, repeats=2, threads=(1, 2), literal=literal)
+
+
+def test_every_series_is_measured_on_every_pair_and_thread_setting(figures):
+    assert (figures["threads"], list(figures["more_threads"])) == (1, ["2"])
+    for row in (figures["sizes"]["320x240"], figures["more_threads"]["2"]["320x240"]):
+        assert row["samples"] == 2 * 2
+        assert row["without_answer"] == dict.fromkeys(bench.SERIES, 0)
+        for name in bench.SERIES:
+            assert 0.0 < row[f"{name}_s"]["median"] <= row[f"{name}_s"]["p95"]
+            assert sum(row["answers"][name].values()) == 4
+        assert {"frames", "features", "flow", "clusters", "lines"} <= set(row["steps"]["other"])
+        assert set(row["steps"]["sfm"]) == {"features", "matching", "essential", "triangulation"}
+    assert figures["literal_n_init"] == PARAMS.kmeans_restarts
+    counts = [each["n"] for each in figures["points"]]
+    assert len(counts) == 2 * 5
+    assert max(counts) > min(counts)
+    assert counts[0] < 200 < counts[-1]
+
+
+def test_steps_add_up_to_the_whole(figures):
+    row = figures["sizes"]["320x240"]
+    for name in ("first", "other", "sfm"):
+        steps = sum(step["median"] for step in row["steps"][name].values())
+        assert 0.3 * row[f"{name}_s"]["median"] < steps < 2.0 * row[f"{name}_s"]["median"]
+
+
+def test_ratios_are_medians_over_pairs_and_leave_out_what_has_no_answer():
+    samples = bench.Samples()
+    for literal, first in ((4.0, 1.0), (9.0, 3.0), (None, 1.0), (20.0, 2.0), (8.0, None)):
+        samples.note("literal", literal, "x")
+        samples.note("first", first, "x")
+        for name in ("literal_other", "other", "floor", "sfm"):
+            samples.note(name, None, "x")
+    row = bench._summary(samples, {"peak_mb": None})
+    assert row["literal_over_first"] == 4.0
+    assert row["literal_s"] == pytest.approx({"median": 8.5, "p95": np.percentile([4, 8, 9, 20], 95)})
+    assert row["literal_over_other"] is None
+    assert row["without_answer"]["literal"] == 1
+
+
+def test_outside_a_checkout_the_literal_figures_are_null(monkeypatch, tmp_path):
+    monkeypatch.setattr(bench, "_LITERAL_FILE", tmp_path / "paper.py")
+    assert bench.literal_reference() is None
+    row = bench.run({SMALL: generated_stream(SMALL, 3)}, PARAMS, repeats=1, threads=(1,), literal=None)[
+        "sizes"
+    ]["320x240"]
+    assert row["literal_s"] is row["literal_other_s"] is row["literal_over_first"] is None
+    assert row["literal_over_other"] is None
+    assert row["other_s"]["median"] > 0.0
+
+
+def test_threads_are_as_they_were_afterwards():
+    before = cv2.getNumThreads()
+    with bench.limited_threads(1):
+        assert cv2.getNumThreads() == 1
+    assert cv2.getNumThreads() == before
+
+
+def test_memory_is_that_of_a_process_with_nothing_else_in_it():
+    ballast = np.ones(400_000_000 // 8)  # more than the whole of the other process, were it counted
+    found = peak_memory(generated_stream(SMALL, 3), PARAMS)
+    assert ballast.sum() > 0
+    assert found["peak_mb"] is not None
+    assert found["peak_imports_mb"] is not None
+    assert 20.0 < found["peak_imports_mb"] <= found["peak_mb"] < 380.0
+
+
+def test_the_generated_corridor_is_repeatable_and_moves_as_it_says():
+    first, second = generated_stream((480, 360), 3), generated_stream((480, 360), 3)
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    camera = bench.CameraModel.from_hfov(480, 360, 80.0)
+    found = reconstruct(first[0], first[1], camera)
+    assert found.failure is None
+    assert math.degrees(math.acos(min(1.0, found.translation_earlier[2]))) < 3.0
+    with pytest.raises(ValueError, match="two frames"):
+        generated_stream(SMALL, 1)
+
+
+def test_given_frames_keep_their_shape_when_resized():
+    frame = np.zeros((360, 540), np.uint8)
+    cv2.circle(frame, (270, 180), 90, 255, cv2.FILLED)
+    for size in ((640, 480), (1280, 720), (200, 400)):
+        (found,) = resized_stream([frame], size)
+        assert found.shape == size[::-1]
+        rows, columns = np.flatnonzero(found.max(axis=1) > 127), np.flatnonzero(found.max(axis=0) > 127)
+        if len(columns) < size[0]:  # not cut off at the sides
+            assert len(rows) == pytest.approx(len(columns), abs=3)
+
+
+def test_a_pair_becomes_a_stream_there_and_back():
+    a, b, c = (np.full((2, 2), value, np.uint8) for value in (1, 2, 3))
+    assert [int(frame[0, 0]) for frame in there_and_back((a, b), 5)] == [1, 2, 1, 2, 1]
+    assert [int(frame[0, 0]) for frame in there_and_back((a, b, c), 6)] == [1, 2, 3, 2, 1, 2]
+    assert len(there_and_back((a, b, c), 2)) == 3
+
+
+def test_the_longest_run_of_pairs():
+    assert longest_run([("1", "2"), ("5", "6"), ("6", "7"), ("7", "8"), ("9", "10")]) == ["5", "6", "7", "8"]
+    assert longest_run([]) == []
+
+
+def test_the_command_prints_json_and_draws(capsys, tmp_path):
+    images = [str(OFFICE / name) for name in ("00184.jpg", "00185.jpg")]
+    plot = tmp_path / "plot.png"
+    code = main(
+        [
+            "bench",
+            *images,
+            "--size",
+            "360x240",
+            "--repeats",
+            "1",
+            "--threads",
+            "1",
+            "--json",
+            "--plot",
+            str(plot),
+        ]
+    )
+    out = capsys.readouterr().out
+    assert code == 0
+    found = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} in JSON"))
+    assert list(found["sizes"]) == ["360x240"]
+    assert found["frames"] == "00184.jpg and 00185.jpg there and back, resized"
+    assert {"threads", "machine", "sizes"} <= set(found)
+    assert cv2.imread(str(plot)).shape[1] > 1000
+    assert "360 x 240" in table_of(found)
+
+
+def test_a_chart_without_literal_and_points_is_drawn(figures):
+    bare = json.loads(json.dumps(figures))
+    bare["points"] = []
+    for row in bare["sizes"].values():
+        row["literal_s"] = row["literal_other_s"] = None
+    assert performance_chart(bare).std() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["a.png"], "allowed are two images or one folder"),
+        (["no/such.png", "b.png"], "cannot be read"),
+        (["{empty}"], "found 0 images"),
+        (["--preset", "nobody"], "allowed are default, paper"),
+        (["--size", "64x64", "--params", "{strict}"], "--size 64x64"),
+    ],
+)
+def test_bad_input_is_one_clear_line(capsys, tmp_path, arguments, words):
+    (tmp_path / "strict.toml").write_text("min_width_px = 100\n")
+    named = [each.format(empty=tmp_path / "none", strict=tmp_path / "strict.toml") for each in arguments]
+    (tmp_path / "none").mkdir()
+    assert main(["bench", *named]) == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("size", ["640", "0x480", "640x99999", "x"])
+def test_a_size_that_cannot_be_is_refused(size, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["bench", "--size", size])
+    assert stop.value.code == 2
+    assert "allowed is WIDTHxHEIGHT" in capsys.readouterr().err

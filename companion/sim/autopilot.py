@@ -1,4 +1,4 @@
-"""A fake PX4 on UDP."""
+"""A fake PX4 or ArduPilot Copter on UDP."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ import socket
 from collections import Counter
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 from companion.clock import Clock, RealClock
 from companion.errors import LinkError
 from companion.guidance.observation import Pose
+from companion.sim.ardupilot_controller import ArduPilotController
+from companion.sim.ardupilot_modes import CopterMode
 from companion.sim.autopilot_endpoint import Address, AutopilotEndpoint, SetpointRecord
 from companion.sim.commander import Result
+from companion.sim.controller import Controller
 from companion.sim.estimate_errors import ErringEstimate
 from companion.sim.flight_controller import FlightController
 from companion.sim.link_faults import FaultyLink, LinkFaults
-from companion.sim.parameters import ParameterTable
+from companion.sim.parameters import COPTER_DEFAULTS, ParameterTable
 from companion.sim.px4_modes import FlightMode
 from companion.sim.recorded_poses import RecordedPoses
 from companion.sim.telemetry import LandedState
@@ -29,10 +32,10 @@ _MOST_PEERS = 8
 
 
 class FakeAutopilot:
-    """A PX4-like autopilot that flies a simulated vehicle, or replays recorded poses, on UDP.
+    """An autopilot that flies a simulated vehicle, or replays recorded poses, on UDP.
 
-    ``async with`` is its lifetime. It behaves as measured on PX4 v1.16.1: modes, arming, entry into and loss
-    of OFFBOARD, which setpoints are taken, and the rates of its telemetry.
+    ``async with`` is its lifetime. It behaves as measured on PX4 v1.16.1 or ArduCopter 4.7-dev: modes, arming, entry
+    into and loss of OFFBOARD or GUIDED, which setpoints are taken, and what it sends by itself.
 
     Parameters
     ----------
@@ -45,10 +48,12 @@ class FakeAutopilot:
         What it flies; by default at PX4's measured response, on the ground at the origin.
     replay
         Report these poses instead of flying; the first one until ``start_replay``.
+    personality
+        ``px4`` or ``ardupilot``.
     parameters
-        PX4 parameters that differ from the defaults, for example ``{"COM_OBL_RC_ACT": 5}``.
+        Parameters that differ from that autopilot's defaults, for example ``{"COM_OBL_RC_ACT": 5}``.
     mode, armed
-        The state to begin with.
+        The state to begin with; by default HOLD, of ArduPilot STABILIZE.
     system_id, component_id
         Its MAVLink identity.
     clock
@@ -73,8 +78,9 @@ class FakeAutopilot:
         local: Address = ("127.0.0.1", 0),
         vehicle: Vehicle | None = None,
         replay: RecordedPoses | None = None,
+        personality: Literal["px4", "ardupilot"] = "px4",
         parameters: Mapping[str, int | float] | None = None,
-        mode: FlightMode = FlightMode.HOLD,
+        mode: FlightMode | CopterMode | None = None,
         armed: bool = False,
         system_id: int = 1,
         component_id: int = 1,
@@ -85,11 +91,12 @@ class FakeAutopilot:
         erring: ErringEstimate | None = None,
     ) -> None:
         self._clock: Clock = clock if clock is not None else RealClock()
-        self._controller = FlightController(
+        self._controller = _controller_of(
+            personality,
             self._clock.now_ns(),
             vehicle=vehicle,
             replay=replay,
-            parameters=ParameterTable(parameters),
+            parameters=parameters,
             mode=mode,
             armed=armed,
             system_id=system_id,
@@ -151,9 +158,14 @@ class FakeAutopilot:
         return host, port
 
     @property
-    def mode(self) -> FlightMode:
+    def mode(self) -> FlightMode | CopterMode:
         """The mode it flies in."""
         return self._controller.mode
+
+    @property
+    def crashed(self) -> str:
+        """What ended the autopilot's program (a NaN in a setpoint ends ArduPilot's), "" while it runs."""
+        return self._controller.crashed
 
     @property
     def armed(self) -> bool:
@@ -232,10 +244,10 @@ class FakeAutopilot:
         """Say when the first recorded pose is true."""
         self._controller.start_replay(t0_monotonic_ns)
 
-    def change_mode(self, mode: FlightMode) -> Result:
+    def change_mode(self, mode: FlightMode | CopterMode) -> Result:
         """Change the mode as the pilot would, with hands on centred sticks from now on."""
         self._controller.pilot_present = True
-        return self._controller.request_mode(mode, self._clock.now_ns())
+        return self._controller.request_custom_mode(mode.custom_mode, self._clock.now_ns())
 
     def arm(self) -> Result:
         """Arm as the pilot would."""
@@ -309,6 +321,55 @@ class FakeAutopilot:
         if self._transport is not None and not self._transport.is_closing():
             self._transport.sendto(datagram, peer)
             self.datagrams_sent += 1
+
+
+def _controller_of(
+    personality: Literal["px4", "ardupilot"],
+    now_ns: int,
+    *,
+    vehicle: Vehicle | None,
+    replay: RecordedPoses | None,
+    parameters: Mapping[str, int | float] | None,
+    mode: FlightMode | CopterMode | None,
+    armed: bool,
+    system_id: int,
+    component_id: int,
+    erring: ErringEstimate | None,
+) -> Controller:
+    """Return the autopilot behind the link.
+
+    Raises
+    ------
+    ValueError
+        When the mode is one of the other autopilot.
+    """
+    if personality == "px4":
+        if isinstance(mode, CopterMode):
+            raise ValueError(f"PX4 has no mode {mode.name}")
+        return FlightController(
+            now_ns,
+            vehicle=vehicle,
+            replay=replay,
+            parameters=ParameterTable(parameters),
+            mode=FlightMode.HOLD if mode is None else mode,
+            armed=armed,
+            system_id=system_id,
+            component_id=component_id,
+            erring=erring,
+        )
+    if isinstance(mode, FlightMode):
+        raise ValueError(f"ArduPilot has no mode {mode.name}")  # noqa: TRY004 - the value is not one of its modes
+    return ArduPilotController(
+        now_ns,
+        vehicle=vehicle,
+        replay=replay,
+        parameters=ParameterTable(parameters, defaults=COPTER_DEFAULTS, bytewise=False),
+        mode=CopterMode.STABILIZE if mode is None else mode,
+        armed=armed,
+        system_id=system_id,
+        component_id=component_id,
+        erring=erring,
+    )
 
 
 class _Receiver(asyncio.DatagramProtocol):

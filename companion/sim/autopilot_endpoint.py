@@ -15,8 +15,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guidance.setpoint import LocalSetpoint, Setpoint
 from companion.sim.commander import Result
-from companion.sim.flight_controller import FlightController
-from companion.sim.px4_modes import FlightMode, mode_from_numbers
+from companion.sim.controller import Controller
 from companion.sim.telemetry import STREAMS, StreamSchedule
 from companion.sim.wire import FrameReader, FrameWriter, ReceivedFrame, global_setpoint, local_setpoint
 
@@ -76,7 +75,7 @@ class AutopilotEndpoint:
 
     def __init__(
         self,
-        controller: FlightController,
+        controller: Controller,
         *,
         system_id: int = 1,
         component_id: int = 1,
@@ -93,7 +92,7 @@ class AutopilotEndpoint:
         self._component_id = component_id
         self._reader = FrameReader()
         self._writer = FrameWriter(system_id, component_id)
-        self._schedule = StreamSchedule()
+        self._schedule = StreamSchedule(controller.default_streams)
         self._parameters_to_send: deque[int] = deque()
         self._boot_until_ns = 0
 
@@ -106,7 +105,7 @@ class AutopilotEndpoint:
         """Restart: silent and deaf for two seconds, then with the clock at zero and default streams."""
         self.controller.reboot(now_ns)
         self._writer = FrameWriter(self._system_id, self._component_id)
-        self._schedule = StreamSchedule()
+        self._schedule = StreamSchedule(self.controller.default_streams)
         self._parameters_to_send.clear()
         self._boot_until_ns = now_ns + round(_REBOOT_S * 1e9)
 
@@ -114,7 +113,7 @@ class AutopilotEndpoint:
         """Take one datagram; return the frames that answer it. Malformed input is counted, never raised."""
         answers: list[bytes] = []
         for frame in self._reader.read(datagram):
-            if now_ns < self._boot_until_ns:
+            if now_ns < self._boot_until_ns or self.controller.crashed:
                 break
             self.frame_counts[frame.name] += 1
             if self._keep_frames:
@@ -125,7 +124,7 @@ class AutopilotEndpoint:
     def advance(self, now_ns: int) -> list[bytes]:
         """Let time pass; return the frames that are due."""
         self.controller.advance(now_ns)
-        if now_ns < self._boot_until_ns:
+        if now_ns < self._boot_until_ns or self.controller.crashed:
             return []
         snapshot = self.controller.snapshot()
         messages = [STREAMS[i].build(snapshot) for i in self._schedule.due(snapshot.time_boot_us)]
@@ -159,7 +158,7 @@ class AutopilotEndpoint:
             case "COMMAND_LONG" | "COMMAND_INT":
                 return self._command(frame, now_ns)
             case "SET_MODE":
-                self._set_mode(message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF, now_ns)
+                self.controller.request_custom_mode(message.custom_mode, now_ns)
             case "PARAM_REQUEST_LIST":
                 self._parameters_to_send.extend(range(len(self.controller.parameters)))
             case "PARAM_REQUEST_READ":
@@ -227,13 +226,13 @@ class AutopilotEndpoint:
             case mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
                 result = self._arm(p1, force=p2 == _FORCE, now_ns=now_ns)
             case mavlink.MAV_CMD_DO_SET_MODE:
-                result = self._set_mode(_whole(p2), _whole(p3), now_ns)
+                result = self.controller.request_mode_by_command(_whole(p2), _whole(p3), now_ns)
             case mavlink.MAV_CMD_NAV_TAKEOFF:
-                result = self.controller.request_mode(FlightMode.TAKEOFF, now_ns)
+                result = self.controller.request_takeoff(_height(message), now_ns)
             case mavlink.MAV_CMD_NAV_LAND:
-                result = self.controller.request_mode(FlightMode.LAND, now_ns)
+                result = self.controller.request_land(now_ns)
             case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
-                result = self.controller.request_mode(FlightMode.RTL, now_ns)
+                result = self.controller.request_return(now_ns)
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
                 result = (
                     Result.ACCEPTED if self._schedule.set_interval(_whole(p1), p2) else Result.UNSUPPORTED
@@ -264,10 +263,6 @@ class AutopilotEndpoint:
         if wanted == 0.0:
             return self.controller.request_disarm(force=force)
         return Result.UNSUPPORTED
-
-    def _set_mode(self, main: int, sub: int, now_ns: int) -> Result:
-        mode = mode_from_numbers(main, sub)
-        return Result.TEMPORARILY_REJECTED if mode is None else self.controller.request_mode(mode, now_ns)
 
     def _request_message(self, message_id: int) -> tuple[Result, list[Any]]:
         stream = STREAMS.get(message_id)
@@ -300,6 +295,11 @@ class AutopilotEndpoint:
         name = parameters.names()[index]
         value, kind = parameters.wire_value(name)
         return mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(parameters), index)
+
+
+def _height(message: Any) -> float:
+    """Return param7 of COMMAND_LONG, z of COMMAND_INT: metres above home."""
+    return float(message.param7 if message.get_type() == "COMMAND_LONG" else message.z)
 
 
 def _whole(value: float) -> int:

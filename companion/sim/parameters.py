@@ -1,6 +1,6 @@
-"""The few PX4 parameters the fake autopilot has, and how PX4 puts them into PARAM_VALUE.
+"""The few parameters that the fake autopilots have, and how they are put into PARAM_VALUE.
 
-https://mavlink.io/en/services/parameter.html (PX4 encodes integers byte-wise)
+https://mavlink.io/en/services/parameter.html (PX4 encodes integers byte-wise, ArduPilot as numbers)
 """
 
 from __future__ import annotations
@@ -29,6 +29,15 @@ _DEFAULTS: dict[str, int | float] = {
     "SYS_AUTOSTART": 4001,
 }
 
+COPTER_DEFAULTS: dict[str, int | float] = {
+    "DISARM_DELAY": 10,
+    "FRAME_CLASS": 1,
+    "GUID_TIMEOUT": 3.0,
+    "MAV_SYSID": 1,
+    "RTL_ALT": 1500,
+}
+"""As ArduCopter 4.7-dev's."""
+
 
 class ParameterTable:
     """Names in alphabetical order, values of int (INT32) or float (REAL32).
@@ -36,7 +45,11 @@ class ParameterTable:
     Parameters
     ----------
     changed
-        Values that differ from PX4's defaults.
+        Values that differ from the defaults.
+    defaults
+        All there are; None: PX4's.
+    bytewise
+        Whether an integer is put into the float byte by byte (PX4), or as the number that it is (ArduPilot).
 
     Raises
     ------
@@ -44,8 +57,15 @@ class ParameterTable:
         When ``changed`` names a parameter that is not there.
     """
 
-    def __init__(self, changed: Mapping[str, int | float] | None = None) -> None:
-        self._values = dict(_DEFAULTS)
+    def __init__(
+        self,
+        changed: Mapping[str, int | float] | None = None,
+        *,
+        defaults: Mapping[str, int | float] | None = None,
+        bytewise: bool = True,
+    ) -> None:
+        self._values = dict(_DEFAULTS if defaults is None else defaults)
+        self._bytewise = bytewise
         for name, value in (changed or {}).items():
             self.set(name, value)
 
@@ -77,6 +97,8 @@ class ParameterTable:
         """Return PARAM_VALUE's ``param_value`` and ``param_type``."""
         value = self._values[name]
         if isinstance(value, int):
+            if not self._bytewise:
+                return float(value), MAV_PARAM_TYPE_INT32
             return struct.unpack("<f", struct.pack("<i", value))[0], MAV_PARAM_TYPE_INT32
         return value, MAV_PARAM_TYPE_REAL32
 
@@ -85,6 +107,11 @@ class ParameterTable:
         if name not in self._values:
             return False
         if isinstance(self._values[name], int):
+            if not self._bytewise:
+                if not math.isfinite(wire_value):
+                    return False
+                self._values[name] = round(wire_value)
+                return True
             if wire_type != MAV_PARAM_TYPE_INT32:
                 return False
             self._values[name] = struct.unpack("<i", struct.pack("<f", wire_value))[0]

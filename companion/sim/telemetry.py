@@ -9,11 +9,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.sim.px4_modes import FlightMode
 from companion.sim.vehicle import Target, Vector3, VehicleState
 
 _METRES_PER_DEGREE = 111_319.5
@@ -42,6 +41,20 @@ class LandedState(IntEnum):
     LANDING = 4
 
 
+class Mode(Protocol):
+    """A flight mode as HEARTBEAT shows it."""
+
+    @property
+    def custom_mode(self) -> int:
+        """HEARTBEAT.custom_mode."""
+        ...
+
+    @property
+    def base_mode(self) -> int:
+        """HEARTBEAT.base_mode of a disarmed vehicle in this mode."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """Everything that telemetry tells, at one time.
@@ -62,17 +75,20 @@ class Snapshot:
         Where it was armed.
     reset_counter
         Jumps of the estimate so far, modulo 256.
+    is_ardupilot
+        Whose telemetry it is: ArduPilot's, else PX4's.
     """
 
     time_boot_us: int
     time_unix_us: int
     vehicle: VehicleState
-    mode: FlightMode
+    mode: Mode
     armed: bool
     landed: LandedState
     target: Target | None
     home_ned_m: Vector3
     reset_counter: int
+    is_ardupilot: bool = False
 
     @property
     def time_boot_ms(self) -> int:
@@ -83,12 +99,18 @@ class Snapshot:
 def _heartbeat(s: Snapshot) -> Any:
     return mavlink.MAVLink_heartbeat_message(
         type=mavlink.MAV_TYPE_QUADROTOR,
-        autopilot=mavlink.MAV_AUTOPILOT_PX4,
+        autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA if s.is_ardupilot else mavlink.MAV_AUTOPILOT_PX4,
         base_mode=s.mode.base_mode | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if s.armed else 0),
         custom_mode=s.mode.custom_mode,
-        system_status=mavlink.MAV_STATE_ACTIVE if s.armed else mavlink.MAV_STATE_STANDBY,
+        system_status=_system_status(s),
         mavlink_version=3,
     )
+
+
+def _system_status(s: Snapshot) -> int:
+    """PX4 is active when armed, ArduPilot when it flies."""
+    active = s.landed is not LandedState.ON_GROUND if s.is_ardupilot else s.armed
+    return int(mavlink.MAV_STATE_ACTIVE if active else mavlink.MAV_STATE_STANDBY)
 
 
 def _attitude(s: Snapshot) -> Any:
@@ -145,6 +167,8 @@ def _position_target_local_ned(s: Snapshot) -> Any:
             0.0,
         )
     position = [_NAN if p is None else p for p in target.position_ned_m]
+    if s.is_ardupilot:
+        return _position_target_of_ardupilot(s, target)
     yaw = s.vehicle.yaw_rad if target.yaw_rad is None else target.yaw_rad
     yaw_rate = 0.0 if target.yaw_rate_rad_s is None else target.yaw_rate_rad_s
     return mavlink.MAVLink_position_target_local_ned_message(
@@ -158,6 +182,18 @@ def _position_target_local_ned(s: Snapshot) -> Any:
         0.0,
         yaw,
         yaw_rate,
+    )
+
+
+def _position_target_of_ardupilot(s: Snapshot, target: Target) -> Any:
+    """Return it as ArduCopter sends it: the position alone, or the velocity alone, as the setpoint was."""
+    if any(p is None for p in target.position_ned_m):
+        place, mask = [0.0, 0.0, 0.0], 3527
+    else:
+        place, mask = [p or 0.0 for p in target.position_ned_m], 3576
+    velocity = target.velocity_ned_m_s if mask == 3527 else (0.0, 0.0, 0.0)
+    return mavlink.MAVLink_position_target_local_ned_message(
+        s.time_boot_ms, mavlink.MAV_FRAME_LOCAL_NED, mask, *place, *velocity, 0.0, 0.0, 0.0, 0.0, 0.0
     )
 
 
@@ -238,17 +274,23 @@ def _mission_current(_: Snapshot) -> Any:
     return mavlink.MAVLink_mission_current_message(0)
 
 
-def _autopilot_version(_: Snapshot) -> Any:
+def _autopilot_version(s: Snapshot) -> Any:
+    encoding = (
+        mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+        if s.is_ardupilot
+        else mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    )
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-        | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+        | encoding
+        | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_GLOBAL_INT
         | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
         | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     )
-    version_1_16_1_release = 1 << 24 | 16 << 16 | 1 << 8 | 255
+    version = 4 << 24 | 7 << 16 if s.is_ardupilot else 1 << 24 | 16 << 16 | 1 << 8 | 255
     none = [0] * 8
     return mavlink.MAVLink_autopilot_version_message(
-        capabilities, version_1_16_1_release, 0, 0, 0, none, none, none, 0, 0, 1
+        capabilities, version, 0, 0, 0, none, none, none, 0, 0, 1
     )
 
 
@@ -309,10 +351,21 @@ STREAMS: dict[int, Stream] = {
 }
 
 
-class StreamSchedule:
-    """Which messages are due; SET_MESSAGE_INTERVAL acts here."""
+HEARTBEAT_ALONE = frozenset({int(mavlink.MAVLINK_MSG_ID_HEARTBEAT)})
+"""What ArduPilot sends by itself."""
 
-    def __init__(self) -> None:
+
+class StreamSchedule:
+    """Which messages are due; SET_MESSAGE_INTERVAL acts here.
+
+    Parameters
+    ----------
+    by_default
+        Ids of those that are sent without being asked for; None: all that have a rate.
+    """
+
+    def __init__(self, by_default: frozenset[int] | None = None) -> None:
+        self._by_default = by_default
         self._interval_us: dict[int, int] = {}
         self._due_us: dict[int, int] = {}
         for message_id in STREAMS:
@@ -327,7 +380,8 @@ class StreamSchedule:
         if message_id not in STREAMS or not math.isfinite(interval_us):
             return False
         if interval_us == 0:
-            rate_hz = STREAMS[message_id].rate_hz
+            is_default = self._by_default is None or message_id in self._by_default
+            rate_hz = STREAMS[message_id].rate_hz if is_default else 0.0
             interval = round(1e6 / rate_hz) if rate_hz > 0 else -1
         else:
             interval = -1 if interval_us < 0 else min(max(1000, round(interval_us)), 2**31 - 1)

@@ -1,4 +1,4 @@
-"""Command line of the companion service: ``companion run | config | check-config | demo``."""
+"""Command line of the companion service: ``companion run | config | check-config | demo | sim``."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from companion.errors import CompanionError
+from companion.errors import CompanionError, first_of
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong usage."""
-    arguments = _parser().parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    arguments = _sim_parser().parse_args(words[1:]) if words[:1] == ["sim"] else _parser().parse_args(words)
     try:
         code: int = arguments.command(arguments)
     except CompanionError as error:
@@ -57,7 +58,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     demo.set_defaults(command=_demo)
+
+    # Its command line is its own (``_sim_parser``); here it is for the list of commands.
+    commands.add_parser("sim", help="fly closed loop in a simulated indoor world", add_help=False)
     return parser
+
+
+def _sim_parser() -> argparse.ArgumentParser:
+    from companion.sim.command import sim_parser  # much that nothing else needs
+
+    return sim_parser()
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -80,22 +90,12 @@ def _run(arguments: argparse.Namespace) -> int:
         try:
             asyncio.run(serve())
         except* CompanionError as group:
-            failure = _first(group)
+            failure = first_of(group)
             log.critical("service_failed", error=str(failure))
             return_code = 1
         else:
             return_code = 0
     return return_code
-
-
-def _first(group: BaseExceptionGroup[CompanionError]) -> CompanionError:
-    """Return the first error of a group of groups."""
-    error: BaseException = group
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    if not isinstance(error, CompanionError):
-        raise error
-    return error
 
 
 def _config(arguments: argparse.Namespace) -> int:

@@ -203,7 +203,7 @@ class FlownFlight:
     frame_to_setpoint_ms: Mapping[str, float | None] = field(default_factory=lambda: percentiles(()))
 
 
-def run_flight(spec: FlightSpec, place: Place, *, record: Path | None = None) -> FlightResult:
+def run_flight(spec: FlightSpec, place: Place | None = None, *, record: Path | None = None) -> FlightResult:
     """Fly.
 
     Parameters
@@ -211,7 +211,7 @@ def run_flight(spec: FlightSpec, place: Place, *, record: Path | None = None) ->
     spec
         Which flight.
     place
-        Where.
+        Where; by default the world that the specification names.
     record
         Write its record (``flight_record.FlightRecord``) there.
 
@@ -220,6 +220,7 @@ def run_flight(spec: FlightSpec, place: Place, *, record: Path | None = None) ->
     companion.errors.CompanionError
         When the world cannot be used or the simulation itself failed.
     """
+    place = place if place is not None else place_of(spec)
     flown = fly(spec, place)
     result = judged(spec, place, flown)
     if record is not None:
@@ -287,3 +288,16 @@ def free_ratios(spec: FlightSpec, place: Place, record: FlightRecord) -> list[fl
         free_m = place.free_distances_m(position, azimuths_rad)
         ratios.append(float(free_m[-1] / free_m.max()) if free_m.max() > 0.0 else 1.0)
     return ratios
+
+
+def place_of(spec: FlightSpec) -> Place:
+    """Return the place of a specification's world.
+
+    Raises
+    ------
+    companion.errors.CompanionError
+        When there is no such world, or its file cannot be used.
+    """
+    from companion.sim.flight_worlds import open_world
+
+    return open_world(spec.world)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import multiprocessing
 import signal
 import socket
@@ -27,6 +28,7 @@ from companion.clock import Clock, RealClock
 from companion.errors import CompanionError, LinkError, SourceError
 from companion.guidance.coordinates import r_body_from_camera, r_ned_from_body
 from companion.guidance.observation import Pose
+from companion.sim.frame_faults import FrameFaults
 from companion.sim.frame_server import Address, FrameServer
 
 if TYPE_CHECKING:
@@ -102,6 +104,8 @@ class CameraFeed:
         Frames a second at most; where rendering is slower, the newest pose is rendered.
     mount
         How the camera sits on the body.
+    faults
+        Frames that are lost or late.
     clock
         Where time comes from.
     start_timeout_s
@@ -124,6 +128,7 @@ class CameraFeed:
         listen: Address = ("127.0.0.1", 0),
         rate_hz: float = 10.0,
         mount: CameraMount | None = None,
+        faults: FrameFaults | None = None,
         clock: Clock | None = None,
         start_timeout_s: float = 30.0,
     ) -> None:
@@ -135,6 +140,7 @@ class CameraFeed:
         self._listen = listen
         self._period_ns = round(1e9 / rate_hz)
         self._mount = mount if mount is not None else CameraMount()
+        self._faults = faults if faults is not None else FrameFaults()
         self._clock: Clock = clock if clock is not None else RealClock()
         self._start_timeout_s = start_timeout_s
         self._process: BaseProcess | None = None
@@ -153,7 +159,7 @@ class CameraFeed:
             context = multiprocessing.get_context("spawn")
             self._process = context.Process(
                 target=_run_child,
-                args=(theirs, self._listen, self._scene, self._camera, self._mount),
+                args=(theirs, self._listen, self._scene, self._camera, self._mount, self._faults),
                 name="camera",
                 daemon=True,
             )
@@ -243,12 +249,13 @@ def _run_child(
     scene: Callable[[], Renderer],
     camera: CameraModel,
     mount: CameraMount,
+    faults: FrameFaults,
 ) -> None:
     # Ctrl-C reaches the whole process group; the parent decides when this one ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     poses.setblocking(False)
     with poses, contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the parent is gone
-        asyncio.run(_serve(poses, listen, scene, camera, mount))
+        asyncio.run(_serve(poses, listen, scene, camera, mount, faults))
 
 
 async def _serve(
@@ -257,13 +264,15 @@ async def _serve(
     make_scene: Callable[[], Renderer],
     camera: CameraModel,
     mount: CameraMount,
+    faults: FrameFaults,
 ) -> None:
     loop = asyncio.get_running_loop()
     try:
         # One thread makes the scene and renders it: a graphics context belongs to the thread that made it.
         with ThreadPoolExecutor(1, "renderer") as thread:
             scene = await loop.run_in_executor(thread, make_scene)
-            await _serve_frames(poses, listen, partial(render_at, scene, camera, mount=mount), thread)
+            render = partial(render_at, scene, camera, mount=mount)
+            await _serve_frames(poses, listen, render, thread, faults)
     except CompanionError as error:
         kind = _FAILED if isinstance(error, LinkError) else _NO_SCENE
         await loop.sock_sendall(poses, kind + str(error).encode()[: _LONGEST_MESSAGE - len(kind)])
@@ -274,15 +283,25 @@ async def _serve_frames(
     listen: Address,
     render: Callable[[Pose], NDArray[np.uint8]],
     thread: ThreadPoolExecutor,
+    faults: FrameFaults,
 ) -> None:
     loop = asyncio.get_running_loop()
+    due_s = loop.time()
     async with FrameServer(listen) as server:
         host, port = server.address
         await loop.sock_sendall(poses, _READY + f"{host}:{port}".encode())
-        while message := await _newest(poses):
+        for number in itertools.count():
+            message = await _newest(poses)
+            if not message:
+                break
+            received_s, delay_ns = loop.time(), faults.delay_ns(number)
+            if delay_ns is None:
+                continue
             time_ns, north_m, east_m, down_m, *q = _POSE.unpack(message)
             pose = Pose(time_ns, north_m, east_m, down_m, (q[0], q[1], q[2], q[3]))
-            server.publish(await loop.run_in_executor(thread, render, pose), time_ns)
+            image = await loop.run_in_executor(thread, render, pose)
+            due_s = max(due_s, received_s + delay_ns / 1e9)  # jitter does not put frames out of order
+            loop.call_at(due_s, server.publish, image, time_ns)
 
 
 async def _newest(poses: socket.socket) -> bytes:

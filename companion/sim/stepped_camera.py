@@ -13,6 +13,7 @@ from companion.clock import Clock
 from companion.frames.source import Frame
 from companion.guidance.observation import Pose
 from companion.sim.camera_feed import CameraMount, Renderer, render_at
+from companion.sim.frame_faults import FrameFaults
 
 if TYPE_CHECKING:
     from detector.camera_model import CameraModel
@@ -33,8 +34,8 @@ class SteppedCamera:
         Where time comes from; it stands still while a frame is rendered.
     rate_hz
         Frames a second.
-    latency_s
-        From exposure to hand-over; less than the time between two frames.
+    faults
+        Frames that are lost or late; none later than the time between two frames.
     mount
         How the camera sits on the body.
     on_frame
@@ -49,20 +50,23 @@ class SteppedCamera:
         *,
         clock: Clock,
         rate_hz: float,
-        latency_s: float = 0.0,
+        faults: FrameFaults | None = None,
         mount: CameraMount | None = None,
         on_frame: Callable[[NDArray[np.uint8], Pose], None] | None = None,
     ) -> None:
         if not 0.0 < rate_hz <= 240.0:
             raise ValueError(f"rate_hz must be above 0 and at most 240, got {rate_hz}")
-        if not 0.0 <= latency_s < 1.0 / rate_hz:
-            raise ValueError(f"latency_s must be at least 0 and below 1 / rate_hz, got {latency_s}")
+        faults = faults if faults is not None else FrameFaults()
+        if faults.longest_delay_s >= 1.0 / rate_hz:
+            raise ValueError(
+                f"faults: frames up to {faults.longest_delay_s:g} s late; allowed: less than 1 / rate_hz"
+            )
         self._scene = scene
         self._camera = camera
         self._pose = pose
         self._clock = clock
         self._period_ns = round(1e9 / rate_hz)
-        self._latency_ns = round(1e9 * latency_s)
+        self._faults = faults
         self._mount = mount
         self._on_frame = on_frame
         self._seq = 0
@@ -79,13 +83,15 @@ class SteppedCamera:
         """Yield a frame each period; does not end by itself."""
         exposed_ns = self._clock.now_ns()
         while True:
-            pose = self._pose()
-            image = render_at(self._scene, self._camera, pose, self._mount)
-            if self._on_frame is not None:
-                self._on_frame(image, pose)
             seq, self._seq = self._seq, self._seq + 1
-            if self._latency_ns:
-                await self._clock.sleep_until_ns(exposed_ns + self._latency_ns)
-            yield Frame(image, pose.time_ns, seq)
+            delay_ns = self._faults.delay_ns(seq)
+            if delay_ns is not None:
+                pose = self._pose()
+                image = render_at(self._scene, self._camera, pose, self._mount)
+                if self._on_frame is not None:
+                    self._on_frame(image, pose)
+                if delay_ns:
+                    await self._clock.sleep_until_ns(exposed_ns + delay_ns)
+                yield Frame(image, pose.time_ns, seq)
             exposed_ns += self._period_ns
             await self._clock.sleep_until_ns(exposed_ns)

@@ -195,7 +195,9 @@ def _given(paths: list[Path], count: int) -> tuple[list[NDArray[np.uint8]], str]
         files = _files_of(paths[0])[:count]
         if len(files) < 2:
             raise InputError(f"{paths[0]}: found {len(files)} images, needed are 2 of one walk")
-        source = f"{paths[0].name}, {len(files)} frames, resized"
+        folder = paths[0].resolve()
+        name = folder.parent.name if folder.name == "images" else folder.name
+        source = f"{name}, {len(files)} frames, resized"
     elif len(paths) == 2 and not any(path.is_dir() for path in paths):
         files, source = paths, f"{paths[0].name} and {paths[1].name} there and back, resized"
     else:

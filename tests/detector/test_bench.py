@@ -14,7 +14,8 @@ from detector import bench
 from detector.bench_frames import generated_stream, resized_stream, there_and_back
 from detector.bench_memory import peak_memory
 from detector.cli import main
-from detector.commands.bench import longest_run, table_of
+from detector.commands import inputs
+from detector.commands.bench import _given, longest_run, table_of
 from detector.drawing.performance import performance_chart
 from detector.params import DetectorParams
 from detector.two_view import reconstruct
@@ -130,6 +131,22 @@ def test_a_pair_becomes_a_stream_there_and_back():
 def test_the_longest_run_of_pairs():
     assert longest_run([("1", "2"), ("5", "6"), ("6", "7"), ("7", "8"), ("9", "10")]) == ["5", "6", "7", "8"]
     assert longest_run([]) == []
+
+
+def test_a_folder_is_a_walk_or_the_longest_run_of_its_pairs(tmp_path):
+    folder = tmp_path / "walk" / "images"
+    folder.mkdir(parents=True)
+    for index, frame in enumerate(generated_stream((80, 60), 5)):
+        cv2.imwrite(str(folder / f"{index}.png"), frame)
+    images, source = _given([folder], 4)
+    assert (len(images), source) == (4, "walk, 4 frames, resized")
+    pairs = [{"a": f"images/{a}.png", "b": f"images/{b}.png"} for a, b in ((4, 3), (0, 1), (1, 2))]
+    frames = {f"images/{index}.png": {} for index in range(5)}
+    truth = {"image_size": [80, 60], "K": None, "frames": frames, "pairs": pairs}
+    (tmp_path / "walk" / "groundtruth.json").write_text(json.dumps(truth))
+    images, source = _given([tmp_path / "walk"], 10)
+    assert source == "walk, 3 frames, resized"
+    assert np.array_equal(images[2], inputs.read_image(folder / "2.png"))
 
 
 def test_the_command_prints_json_and_draws(capsys, tmp_path):

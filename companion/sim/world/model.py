@@ -211,6 +211,14 @@ class World(_Thing):
     goal_reachable: Annotated[
         bool, Field(description="false: nothing leads there, and to turn back is right.")
     ] = True
+    reference_path_m: Annotated[
+        tuple[Point, ...],
+        Field(
+            strict=False,
+            max_length=500,
+            description="Corners of a way that can be flown, start and goal among them; made worlds have one.",
+        ),
+    ] = ()
     time_limit_s: Annotated[float, Field(ge=5.0, le=3600.0, description="Then a flight is over.")] = 120.0
     light: Light = Light()
     walls: Annotated[tuple[Wall, ...], Field(strict=False, max_length=500)] = ()
@@ -220,6 +228,8 @@ class World(_Thing):
     furniture: Annotated[tuple[Furniture, ...], Field(strict=False, max_length=500)] = ()
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
+        if not self.walls:
+            return (Disagreement("walls", "none", "at least one"),)
         ceiling_m = self.ceiling_m
         tops_m = {"start.height_m": self.start.height_m, "goal.height_m": self.goal.height_m}
         for index, wall in enumerate(self.walls):

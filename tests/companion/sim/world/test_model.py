@@ -57,9 +57,13 @@ def test_a_wrong_key_is_found_where_it_is(more: dict[str, Any], loc: tuple[str |
         (_wall(pictures=[{"at_m": 0.1, "side": "left", "texture": "wood_1"}]), r"pictures\[0\].at_m"),
         (_wall(openings=[{"at_m": 1.0, "width_m": 1.0}, {"at_m": 1.5, "width_m": 1.0}]), "overlap"),
         ({"walls": [{"from_m": [1, 1], "to_m": [1, 1]}]}, "to_m: found 0 m from from_m"),
+        ({"name": "open air"}, "walls: found none; allowed: at least one"),
         (_wall(bottom_m=1.0, height_m=2.0), r"walls\[0\].height_m: found a top at 3 m"),
-        ({"people": [{"centre_m": [1, 1], "height_m": 2.0}], "ceiling_m": 1.9}, r"people\[0\].height_m"),
-        ({"goal": {"north_m": 5, "east_m": 0, "height_m": 3.0}}, "goal.height_m"),
+        (
+            _wall() | {"people": [{"centre_m": [1, 1], "height_m": 2.0}], "ceiling_m": 1.9},
+            r"people\[0\].height_m",
+        ),
+        (_wall() | {"goal": {"north_m": 5, "east_m": 0, "height_m": 3.0}}, "goal.height_m"),
     ],
 )
 def test_keys_that_cannot_both_hold_are_named(more: dict[str, Any], words: str) -> None:

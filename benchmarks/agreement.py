@@ -32,7 +32,8 @@ import cv2
 import numpy as np
 
 # This folder holds a detector.py too, and Python looks here first.
-sys.path[0] = str(Path(__file__).parents[1])
+if __name__ == "__main__":
+    sys.path[0] = str(Path(__file__).parents[1])
 
 from companion.guidance.coordinates import r_body_from_camera
 from companion.sim.scene import corridor, empty_room, room_with_wall, square_wall

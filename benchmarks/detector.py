@@ -15,7 +15,8 @@ import sys
 from pathlib import Path
 
 # This folder holds a detector.py too, and Python looks here first.
-sys.path[0] = str(Path(__file__).parents[1])
+if __name__ == "__main__":
+    sys.path[0] = str(Path(__file__).parents[1])
 
 from detector.commands import bench, inputs
 from detector.commands.inputs import InputError

@@ -64,8 +64,8 @@ class Ending:
     ----------
     result
         ``FlightResult.as_dict()``; None where the simulation failed.
-    as_it_should
-        Whether it ended as a flight there should: at the goal, or without a collision where nothing leads to it.
+    succeeded
+        Whether it ended at the goal, or without a collision in a world where nothing leads there.
     error
         Why the simulation failed, one line; None where it did not.
     record, video
@@ -75,7 +75,7 @@ class Ending:
     """
 
     result: Mapping[str, Any] | None = None
-    as_it_should: bool = False
+    succeeded: bool = False
     error: str | None = None
     record: bytes | None = None
     video: bytes | None = None
@@ -92,7 +92,7 @@ class Finished:
         Which one.
     outcome
         That of ``FlightResult``, or ``failed simulation``.
-    as_it_should, result, error
+    succeeded, result, error
         As in ``Ending``.
     record, video
         Paths of its files, None where it has none.
@@ -100,7 +100,7 @@ class Finished:
 
     flight: PlannedFlight
     outcome: str
-    as_it_should: bool
+    succeeded: bool
     result: Mapping[str, Any] | None
     error: str | None
     record: Path | None
@@ -225,7 +225,7 @@ def finished_flights(flights: Sequence[PlannedFlight], folder: Path) -> dict[str
             raise SuiteError(f"{path}: was flown with other settings; give another folder for this suite")
         if kept["result"] is not None:
             finished[flight.name] = _finished(
-                folder, flight, kept["result"], kept["as_it_should"], kept["error"]
+                folder, flight, kept["result"], kept["succeeded"], kept["error"]
             )
     return finished
 
@@ -242,7 +242,7 @@ def _keep(folder: Path, flight: PlannedFlight, ending: Ending) -> Finished:
         {
             "flight": flight.as_dict(),
             "result": ending.result,
-            "as_it_should": ending.as_it_should,
+            "succeeded": ending.succeeded,
             "error": ending.error,
         },
         indent=1,
@@ -260,21 +260,21 @@ def _keep(folder: Path, flight: PlannedFlight, ending: Ending) -> Finished:
         half_written.replace(path)
     except OSError as error:
         raise SuiteError(f"{path}: cannot be written: {error.strerror}") from error
-    return _finished(folder, flight, ending.result, ending.as_it_should, ending.error)
+    return _finished(folder, flight, ending.result, ending.succeeded, ending.error)
 
 
 def _finished(
     folder: Path,
     flight: PlannedFlight,
     result: Mapping[str, Any] | None,
-    as_it_should: bool,
+    succeeded: bool,
     error: str | None,
 ) -> Finished:
     record, video = (_path(folder, flight, suffix) for suffix in ("npz", "mp4"))
     return Finished(
         flight=flight,
         outcome=FAILED_SIMULATION if result is None else str(result["outcome"]),
-        as_it_should=as_it_should,
+        succeeded=succeeded,
         result=result,
         error=error,
         record=record if record.exists() else None,

@@ -78,7 +78,7 @@ class FlightProcesses:
                 return Ending(error=answer["error"], log=text)
             return Ending(
                 result=answer["result"],
-                as_it_should=answer["as_it_should"],
+                succeeded=answer["succeeded"],
                 record=_bytes(folder / "record.npz"),
                 video=_bytes(folder / "video.mp4"),
                 log=text,

@@ -12,12 +12,15 @@ from typing import Any, Final
 from companion.sim.suite import FAILED_SIMULATION, Finished, SuiteError
 
 OUTCOMES: Final = ("reached", "collided", "stuck", "timeout", FAILED_SIMULATION)
+OUTCOME_HEADS: Final = (*OUTCOMES[:-1], "failed")
+"""As columns are headed."""
+
 ALL_WORLDS: Final = "all"
 
 _NOTE = """\
-As it should: at the goal, or without a collision where the world says that nothing leads there. Times, ways and free ratios are medians over
-the flights that were simulated to their end (time and way: over those that reached the goal); clearance is the least of all. The free ratio of a flight is its median of free
-distance in the direction answered / greatest free distance in view."""
+Succeeded: at the goal, or without a collision where the world says that nothing leads there. Failed: the simulation itself.
+Clearance is the least of all flights; time and way are medians over those that reached the goal. The free ratio of a flight is its
+median of (free distance in the direction answered) / (greatest free distance in view); here is the median of those."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +35,8 @@ class Row:
         How many.
     outcomes
         How many ended in each way, in the order of ``OUTCOMES``.
-    as_it_should
-        How many ended as they should.
+    succeeded
+        How many did.
     min_clearance_m
         Least distance to anything on any of them.
     time_s, path_m
@@ -46,7 +49,7 @@ class Row:
     method: str
     flights: int
     outcomes: tuple[int, ...]
-    as_it_should: int
+    succeeded: int
     min_clearance_m: float | None
     time_s: float | None
     path_m: float | None
@@ -62,7 +65,7 @@ class Row:
                 outcome.replace(" ", "_"): count
                 for outcome, count in zip(OUTCOMES, self.outcomes, strict=True)
             },
-            "as_it_should": self.as_it_should,
+            "succeeded": self.succeeded,
             "min_clearance_m": self.min_clearance_m,
             "time_s": self.time_s,
             "path_m": self.path_m,
@@ -97,7 +100,7 @@ def report_json(finished: Sequence[Finished], folder: Path) -> str:
                 {
                     "name": flight.flight.name,
                     "outcome": flight.outcome,
-                    "as_it_should": flight.as_it_should,
+                    "succeeded": flight.succeeded,
                     "error": flight.error,
                     "record": _below(folder, flight.record),
                     "video": _below(folder, flight.video),
@@ -113,18 +116,17 @@ def report_json(finished: Sequence[Finished], folder: Path) -> str:
 
 def report_markdown(finished: Sequence[Finished], folder: Path) -> str:
     """Return the tables of a suite as Markdown: by world and method, then every flight, then failed simulations."""
-    short = [outcome.removesuffix(" simulation") for outcome in OUTCOMES]
     parts = [
         "# Simulated flights\n",
         _table(
-            ("world", "method", "flights", *short, "as it should", "clearance, m", "time, s", "way, m", "free ratio"),
+            ("world", "method", "flights", *OUTCOME_HEADS, "succeeded", "clearance, m", "time, s", "way, m", "free ratio"),
             (
                 (
                     row.world,
                     row.method,
                     row.flights,
                     *row.outcomes,
-                    row.as_it_should,
+                    row.succeeded,
                     _figure(row.min_clearance_m, 2),
                     _figure(row.time_s, 1),
                     _figure(row.path_m, 1),
@@ -136,7 +138,7 @@ def report_markdown(finished: Sequence[Finished], folder: Path) -> str:
         f"{_NOTE}\n",
         "## Every flight\n",
         _table(
-            ("world", "seed", "method", "outcome", "as it should", "clearance, m", "time, s", "way, m", "decisions", "video"),
+            ("world", "seed", "method", "outcome", "succeeded", "clearance, m", "time, s", "way, m", "decisions", "video"),
             (_flight_cells(flight, folder) for flight in finished),
         ),
     ]  # fmt: skip
@@ -172,7 +174,7 @@ def _row(world: str, method: str, flown: Sequence[Finished]) -> Row:
         method=method,
         flights=len(flown),
         outcomes=tuple(sum(flight.outcome == outcome for flight in flown) for outcome in OUTCOMES),
-        as_it_should=sum(flight.as_it_should for flight in flown),
+        succeeded=sum(flight.succeeded for flight in flown),
         min_clearance_m=_of(min, (result["min_clearance_m"] for result in results)),
         time_s=_of(statistics.median, (result["time_s"] for result in reached)),
         path_m=_of(statistics.median, (result["path_m"] for result in reached)),
@@ -193,7 +195,7 @@ def _flight_cells(flight: Finished, folder: Path) -> tuple[object, ...]:
         flight.flight.spec.seed,
         flight.flight.spec.method,
         flight.outcome,
-        "yes" if flight.as_it_should else "**no**",
+        "yes" if flight.succeeded else "**no**",
         _figure(result.get("min_clearance_m"), 2),
         _figure(result.get("time_s"), 1),
         _figure(result.get("path_m"), 1),
@@ -209,7 +211,7 @@ def _below(folder: Path, path: Path | None) -> str | None:
 
 
 def _figure(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    return "-" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"  # + 0.0: no minus before 0
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

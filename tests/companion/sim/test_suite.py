@@ -41,7 +41,7 @@ def result_of(flight: PlannedFlight, outcome: str = "reached", **figures: float 
 
 
 def good(flight: PlannedFlight) -> Ending:
-    return Ending(result=result_of(flight), as_it_should=True, record=b"a record")
+    return Ending(result=result_of(flight), succeeded=True, record=b"a record")
 
 
 class Flyer:
@@ -122,7 +122,7 @@ def test_endings_come_back_in_the_order_of_the_suite_with_their_files(tmp_path):
     finished = run_suite(two_by_two(), tmp_path / "new" / "suite", Flyer(), told.append)
     assert [flight.flight for flight in finished] == list(two_by_two())
     assert {flight.flight.name for flight in told} == {flight.name for flight in two_by_two()}
-    assert all(flight.outcome == "reached" and flight.as_it_should for flight in finished)
+    assert all(flight.outcome == "reached" and flight.succeeded for flight in finished)
     assert finished[0].record is not None
     assert finished[0].record.read_bytes() == b"a record"
     assert finished[0].video is None
@@ -162,7 +162,7 @@ def test_a_failed_simulation_is_recorded_and_tried_again(tmp_path):
     (flight,) = flights = plan_flights(["room"], [1], ["off"], TEMPLATE)
     broken = Flyer(lambda _: Ending(error="the simulation was ended by SIGSEGV", log="last words"))
     (finished,) = run_suite(flights, tmp_path, broken)
-    assert (finished.outcome, finished.result, finished.as_it_should) == (FAILED_SIMULATION, None, False)
+    assert (finished.outcome, finished.result, finished.succeeded) == (FAILED_SIMULATION, None, False)
     log = tmp_path / "flights" / f"{flight.name}.log"
     assert log.read_text() == "last words"
     kept = json.loads((tmp_path / "flights" / f"{flight.name}.json").read_text())
@@ -215,9 +215,9 @@ def mixed(tmp_path: Path) -> tuple[Finished, ...]:
     def ending(flight: PlannedFlight) -> Ending:
         match flight.spec.seed, flight.spec.method:
             case 1, "paper":
-                return Ending(result_of(flight, time_s=8.0, min_clearance_m=0.4), as_it_should=True)
+                return Ending(result_of(flight, time_s=8.0, min_clearance_m=0.4), succeeded=True)
             case 2, "paper":
-                return Ending(result_of(flight, time_s=12.0, min_clearance_m=0.3), as_it_should=True)
+                return Ending(result_of(flight, time_s=12.0, min_clearance_m=0.3), succeeded=True)
             case 1, "off":
                 figures = {"min_clearance_m": -0.01, "free_ratio_median": None}
                 return Ending(result_of(flight, "collided", **figures), video=b"a video")
@@ -239,9 +239,9 @@ def test_rows_count_outcomes_by_world_and_method_and_over_all_worlds(tmp_path):
         ("all", "off"),
     ]
     paper, off = rows["door", "paper"], rows["all", "off"]
-    assert (paper.flights, paper.outcomes, paper.as_it_should) == (2, (2, 0, 0, 0, 0), 2)
+    assert (paper.flights, paper.outcomes, paper.succeeded) == (2, (2, 0, 0, 0, 0), 2)
     assert (paper.min_clearance_m, paper.time_s, paper.path_m, paper.free_ratio) == (0.3, 10.0, 5.0, 0.8)
-    assert (off.flights, off.outcomes, off.as_it_should) == (4, (0, 2, 0, 0, 2), 0)
+    assert (off.flights, off.outcomes, off.succeeded) == (4, (0, 2, 0, 0, 2), 0)
     assert (off.min_clearance_m, off.time_s, off.free_ratio) == (-0.01, None, None)
 
 

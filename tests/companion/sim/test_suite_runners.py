@@ -17,7 +17,7 @@ from companion.sim.suite_process import FlightProcesses
 from companion.sim.suite_runners import fly_locally, fly_on_cluster
 
 FLIGHTS = plan_flights(["room"], [1, 2, 3], ["off"], FlightSpec())
-RESULT = '{"result": {"outcome": "reached"}, "as_it_should": true}'
+RESULT = '{"result": {"outcome": "reached"}, "succeeded": true}'
 
 
 def program(body: str) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ def test_what_a_flight_leaves_comes_back():
         "(folder / 'record.npz').write_bytes(b'r'); (folder / 'video.mp4').write_bytes(b'v'); finish()"
     )
     assert ending.result == {"outcome": "reached"}
-    assert (ending.as_it_should, ending.error, ending.record, ending.video) == (True, None, b"r", b"v")
+    assert (ending.succeeded, ending.error, ending.record, ending.video) == (True, None, b"r", b"v")
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def far_away(flight: PlannedFlight) -> Ending:
     """Fly on a worker: a process that is told which flight and says where it was."""
     if flight.spec.seed == 2:
         raise ValueError("no such\nthing here")
-    return Ending(result={"outcome": "reached"}, as_it_should=True, log=str(os.getpid()))
+    return Ending(result={"outcome": "reached"}, succeeded=True, log=str(os.getpid()))
 
 
 def deadly(flight: PlannedFlight) -> Ending:

@@ -241,9 +241,18 @@ class LinkConfig(_Section):
     planner_component_id: Annotated[
         int, Field(ge=0, le=255, description="Component id of the planner, likewise. 0: any.")
     ] = 0
-    signing: Annotated[
-        Literal["forward"], Field(description="Signed setpoints: forward untouched, with an alarm.")
-    ] = "forward"
+    signing_key_file: Annotated[
+        str,
+        Field(
+            description="Key of MAVLink 2 signing: 32 bytes, or 64 hexadecimal digits, in a file that its owner alone may read. Signed setpoints are verified and signed again, our own messages are signed. Empty: signed setpoints pass untouched and unprotected, with an alarm."
+        ),
+    ] = ""
+    signing_link_id: Annotated[
+        int,
+        Field(
+            ge=0, le=255, description="Our link id in signatures. No other link of the network may use it."
+        ),
+    ] = 200
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
         same = self.planner == self.autopilot and not self.planner.endswith(":0")

@@ -51,6 +51,8 @@ from companion.mavlink.telemetry import (
 from companion.run_statistics import RunStatistics
 
 _HEARTBEAT_LOST_NS: Final = 3_500_000_000
+_MOST_REFUSALS: Final = 32
+"""Senders of forged setpoints that are announced: their ids are the forger's choice."""
 _NEVER_NS: Final = -(1 << 62)
 _AUTOPILOTS: Final = {
     MAV_AUTOPILOT_PX4: Autopilot.PX4,
@@ -89,6 +91,7 @@ class Interception:
         self._poses = PoseBuffer(jump_m=guidance.estimator_jump_m)
         self._reference = GlobalReference()
         self._announced_unprotected: set[str] = set()
+        self._announced_refused: set[str] = set()
         self._unusable: set[tuple[int, str]] = set()
         self._reset_counter: int | None = None
         self._autopilot_heartbeat_ns: int | None = None
@@ -164,6 +167,16 @@ class Interception:
         names = [f"{system_id}/{component_id}" for system_id, component_id in sources]
         self._log.warning("rival_setpoints", sources=names, time_ns=now_ns)
         self._identity.status_text(MavSeverity.WARNING, f"void: setpoints from {' and '.join(names)}")
+
+    def on_refused_signature(self, source: Source, reason: str) -> None:
+        """Announce, once for each sender and reason, that a signed setpoint was dropped."""
+        sender = f"{source[0]}/{source[1]}"
+        key = f"{sender}: {reason}"
+        if key in self._announced_refused or len(self._announced_refused) >= _MOST_REFUSALS:
+            return
+        self._announced_refused.add(key)
+        self._log.error("setpoint_signature_refused", sender=sender, reason=reason)
+        self._identity.status_text(MavSeverity.ERROR, f"void: setpoint of {sender} dropped, {reason}")
 
     def on_unprotected(self, kind: str, detail: str) -> None:
         """Announce, once for each kind, that a setpoint passes through as it came."""

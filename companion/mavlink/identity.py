@@ -13,6 +13,7 @@ from typing import Final, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.mavlink.signing import Signatures
 from companion.mavlink.telemetry import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_INVALID,
@@ -73,6 +74,8 @@ class Identity:
         Our own, MAV_COMP_ID_ONBOARD_COMPUTER by default.
     now_ns
         Monotonic time, for the rate limit.
+    signatures
+        Signs what we say; None: it goes unsigned.
     max_waiting
         Different status texts sent in a second, and as many more that may wait.
     """
@@ -84,6 +87,7 @@ class Identity:
         *,
         component_id: int = 191,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        signatures: Signatures | None = None,
         max_waiting: int = 20,
     ) -> None:
         self.vehicle: Heartbeat | None = None
@@ -91,6 +95,7 @@ class Identity:
         self._endpoints = (planner, autopilot)
         self._encoder = mavlink.MAVLink(None, srcSystem=1, srcComponent=component_id)
         self._now_ns = now_ns
+        self._signatures = signatures
         self._max_waiting = max_waiting
         self._waiting: deque[tuple[MavSeverity, str]] = deque()
         self._said_ns: dict[str, int] = {}
@@ -191,6 +196,8 @@ class Identity:
     def _send(self, message: mavlink.MAVLink_message) -> None:
         frame = bytes(message.pack(self._encoder))
         self._encoder.seq = (self._encoder.seq + 1) % 256
+        if self._signatures is not None:
+            frame = self._signatures.sign(frame)
         for endpoint in self._endpoints:
             endpoint.send(frame)
 

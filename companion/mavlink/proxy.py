@@ -9,7 +9,10 @@ What happens to a planner's setpoint:
 setpoint                                             sent to the autopilot
 ===================================================  ===================================================
 a used field is NaN or infinite                      nothing; counted
-signed, or with unknown incompatibility flags        untouched; announced as unprotected
+signed, no key is configured                         untouched; announced as unprotected
+signed, the signature is not accepted                nothing; counted and announced
+signed, the signature is accepted                    as unsigned ones; what is changed is signed again
+with unknown incompatibility flags                   untouched; announced as unprotected
 an attitude (82)                                     untouched; announced as unprotected
 for a system that is not the vehicle                 untouched
 a position or velocity (84, 86)                      what the handler says: `Forward`, one of the replacements,
@@ -38,10 +41,11 @@ from companion.guidance.setpoint import (
     Verdict,
 )
 from companion.mavlink import codec, requests, telemetry
-from companion.mavlink.framing import RawFrame
+from companion.mavlink.framing import INCOMPAT_SIGNED, RawFrame
 from companion.mavlink.identity import is_autopilot
 from companion.mavlink.link import FrameReceiver, LinkCounters
 from companion.mavlink.requests import EngageRequest
+from companion.mavlink.signing import Signatures, link_id_of, without_signature
 from companion.mavlink.sources import SetpointSources, Source
 from companion.mavlink.telemetry import Heartbeat, Telemetry, Unusable
 
@@ -81,6 +85,10 @@ class ProxyHandler(Protocol):
         detail
             What about it is not handled.
         """
+        ...
+
+    def on_refused_signature(self, source: Source, reason: str) -> None:
+        """Take note that a setpoint was dropped because its signature is not accepted; called for each."""
         ...
 
     def on_telemetry(self, message: Telemetry | Unusable, now_ns: int) -> None:
@@ -175,10 +183,18 @@ class InlineProxy:
         Decides on setpoints.
     now_ns
         Monotonic time.
+    signatures
+        Verifies signed setpoints and signs them again; None: there is no key.
     """
 
     def __init__(
-        self, planner: Endpoint, autopilot: Endpoint, handler: ProxyHandler, *, now_ns: Callable[[], int]
+        self,
+        planner: Endpoint,
+        autopilot: Endpoint,
+        handler: ProxyHandler,
+        *,
+        now_ns: Callable[[], int],
+        signatures: Signatures | None = None,
     ) -> None:
         self.counters = ProxyCounters(planner.counters, autopilot.counters)
         self._planner = planner
@@ -190,6 +206,7 @@ class InlineProxy:
         self._autopilot_systems: set[int] = set()
         self._last_failure = ""
         self._sources = SetpointSources()
+        self._signatures = signatures
         planner.on_frames = self._from_planner
         autopilot.on_frames = self._from_autopilot
 
@@ -244,20 +261,44 @@ class InlineProxy:
         if is_elsewhere:
             counters.setpoints_elsewhere += 1
             return frame.data
-        self._note_source(frame, now_ns)
         name = _NAMES[frame.message_id]
-        if frame.is_signed:
-            return self._unprotected(frame, "signed", name)
-        if frame.incompat_flags:
+        signatures = self._signatures
+        if frame.is_signed and signatures is not None:
+            why_not = signatures.verify(frame)
+            if why_not is not None:
+                return self._refused(frame, why_not)
+        self._note_source(frame, now_ns)
+        if frame.incompat_flags & ~INCOMPAT_SIGNED:
             return self._unprotected(frame, name, f"incompatibility flags {frame.incompat_flags:#x}")
+        if frame.is_signed and signatures is None:
+            return self._unprotected(frame, "signed", name)
         if setpoint is None:
             return self._unprotected(frame, name, "not handled")
         try:
             verdict = self._handler.on_setpoint(setpoint, frame.system_id, frame.component_id, now_ns)
+            if isinstance(verdict, Unprotected):
+                return self._unprotected(frame, name, verdict.reason)
+            if frame.is_signed and signatures is not None:
+                return self._carry_out_signed(verdict, frame, signatures)
             return self._carry_out(verdict, frame)
         except Exception as error:  # noqa: BLE001  whatever fails there, this setpoint is held back and the rest goes on
             self._handler_failed("on_setpoint", error)
             return self._dropped("handler error")
+
+    def _carry_out_signed(self, verdict: Verdict, frame: RawFrame, signatures: Signatures) -> bytes:
+        """Return what a signed setpoint becomes: its own bytes where nothing changes, else with our signature."""
+        plain = without_signature(frame)
+        data = self._carry_out(verdict, plain)
+        if not data or data == plain.data:
+            return frame.data if data else data
+        return signatures.sign(data, other_link_id=link_id_of(frame))
+
+    def _refused(self, frame: RawFrame, reason: str) -> bytes:
+        try:
+            self._handler.on_refused_signature((frame.system_id, frame.component_id), reason)
+        except Exception as error:  # noqa: BLE001  a failed announcement must not cost the frames behind it
+            self._handler_failed("on_refused_signature", error)
+        return self._dropped(reason)
 
     def _note_source(self, frame: RawFrame, now_ns: int) -> None:
         rivals = self._sources.note((frame.system_id, frame.component_id), now_ns)
@@ -283,8 +324,6 @@ class InlineProxy:
                 return data
             case Drop():
                 return self._dropped(verdict.reason)
-            case Unprotected():
-                return self._unprotected(frame, _NAMES[frame.message_id], verdict.reason)
         raise TypeError(f"not a verdict: {verdict!r}")
 
     def _dropped(self, reason: str) -> bytes:

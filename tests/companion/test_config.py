@@ -65,7 +65,10 @@ def test_an_integer_does_for_a_float():
         ("[source]\npath = 3", "source.path: found 3; allowed: text"),
         ("[source]\npath = []", "source.path: found a list; allowed: text"),
         ('[source]\nkind = "v4l2"', 'source.kind: found "v4l2"; allowed: one of "file", "socket"'),
-        ('[link]\nsigning = "drop"', 'link.signing: found "drop"; allowed: only "forward"'),
+        (
+            "[link]\nsigning_link_id = 256",
+            "link.signing_link_id: found 256; allowed: whole number from 0 and up to 255",
+        ),
         (
             '[link]\nautopilot = "serial:x"',
             (

@@ -504,6 +504,21 @@ def test_rivals_are_announced():
     assert "void: setpoints from 245/190 and 255/190" in bench.wire.texts()
 
 
+def test_a_refused_signature_is_announced_once_for_each_sender_and_not_for_ever():
+    bench = flying()
+    for _ in range(3):
+        bench.flight.on_refused_signature((245, 190), "replayed")
+    bench.flight.on_refused_signature((245, 190), "wrong signature")
+    assert [e["reason"] for e in bench.events("setpoint_signature_refused")] == [
+        "replayed",
+        "wrong signature",
+    ]
+    assert any("245/190 dropped, replayed" in text for text in bench.wire.texts())
+    for system_id in range(1, 200):
+        bench.flight.on_refused_signature((system_id, 1), "wrong signature")
+    assert len(bench.events("setpoint_signature_refused")) == 32
+
+
 def test_the_status_says_what_was_asked_for_and_what_is_sent_for_every_kind():
     bench = flying()
     bench.send(local(3527, 1, v=(0.5, 0, -0.25)))

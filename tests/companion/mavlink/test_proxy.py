@@ -79,7 +79,14 @@ class ScriptedHandler:
 
     def __init__(self, verdict=None):
         self.verdict = Forward() if verdict is None else verdict
-        self.setpoints, self.telemetry, self.unprotected, self.requests, self.rivals = [], [], [], [], []
+        self.setpoints, self.telemetry, self.unprotected, self.requests, self.rivals, self.refused = (
+            [],
+            [],
+            [],
+            [],
+            [],
+            [],
+        )
 
     def on_setpoint(self, setpoint, system_id, component_id, now_ns):
         self.setpoints.append((setpoint, system_id, component_id, now_ns))
@@ -95,6 +102,9 @@ class ScriptedHandler:
 
     def on_rivals(self, sources, now_ns):
         self.rivals.append(sources)
+
+    def on_refused_signature(self, source, reason):
+        self.refused.append((source, reason))
 
     def on_telemetry(self, message, now_ns):
         self.telemetry.append(message)
@@ -389,6 +399,9 @@ class SubstituteAll:
         pass
 
     def on_rivals(self, sources, now_ns):
+        pass
+
+    def on_refused_signature(self, source, reason):
         pass
 
     def on_telemetry(self, message, now_ns):

@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from companion.config import CameraConfig, Config, DetectorConfig, DisagreementError, SourceConfig
+from companion.config import CameraConfig, Config, DetectorConfig, DisagreementError, LinkConfig, SourceConfig
 from companion.errors import ConfigError
 
 _MAX_FILE_BYTES = 1 << 20
@@ -29,7 +29,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 def load_config(path: str | Path) -> Config:
     """Read a configuration file.
 
-    Relative paths in it (``source.path``, ``camera.file``, ``detector.params_file``) are taken as relative
+    Relative paths in it (``source.path``, ``camera.file``, ``detector.params_file``, ``link.signing_key_file``) are taken as relative
     to the file's own folder.
 
     Parameters
@@ -134,7 +134,10 @@ def _resolve_paths(config: Config, folder: Path) -> Config:
     detector: DetectorConfig = config.detector.model_copy(
         update={"params_file": resolved(config.detector.params_file)}
     )
-    return config.model_copy(update={"source": source, "camera": camera, "detector": detector})
+    link: LinkConfig = config.link.model_copy(
+        update={"signing_key_file": resolved(config.link.signing_key_file)}
+    )
+    return config.model_copy(update={"source": source, "camera": camera, "detector": detector, "link": link})
 
 
 def _section_schemas() -> dict[str, dict[str, Any]]:

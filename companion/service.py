@@ -33,6 +33,7 @@ from companion.log import Log
 from companion.mavlink.identity import Identity
 from companion.mavlink.link import UdpEndpoint
 from companion.mavlink.proxy import InlineProxy
+from companion.mavlink.signing import open_signatures
 from companion.vision.supervisor import VisionSupervisor
 
 _HEALTH_PERIOD_NS: Final = 100_000_000
@@ -103,11 +104,16 @@ class Service:
             await stack.enter_async_context(planner)
             await stack.enter_async_context(autopilot)
             self._links = (planner, autopilot)
+            signatures = open_signatures(config.link)
             identity = Identity(
-                planner, autopilot, component_id=config.link.component_id, now_ns=clock.now_ns
+                planner,
+                autopilot,
+                component_id=config.link.component_id,
+                now_ns=clock.now_ns,
+                signatures=signatures,
             )
             flight = Interception(config, identity=identity, log=log)
-            proxy = InlineProxy(planner, autopilot, flight, now_ns=clock.now_ns)
+            proxy = InlineProxy(planner, autopilot, flight, now_ns=clock.now_ns, signatures=signatures)
 
             def on_report(report: DetectionReport) -> None:
                 self._take_report(flight, report)

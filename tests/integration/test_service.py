@@ -418,6 +418,14 @@ def test_a_port_in_use_is_a_clear_error(tmp_path):
         assert_clear_error(run_companion("run", "-c", str(path)), str(port))
 
 
+def test_a_signing_key_that_others_may_read_is_a_clear_error(tmp_path):
+    (tmp_path / "signing.key").write_bytes(bytes(range(32)))
+    (tmp_path / "signing.key").chmod(0o644)
+    path = config_file(tmp_path, kind="socket", address="127.0.0.1:9")
+    path.write_text(path.read_text().replace("[link]", '[link]\nsigning_key_file = "signing.key"'))
+    assert_clear_error(run_companion("run", "-c", str(path)), str(tmp_path / "signing.key"), "chmod 600")
+
+
 def test_a_demo_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "taken").touch()
     assert_clear_error(run_companion("demo", "-o", str(tmp_path / "taken")), "taken")

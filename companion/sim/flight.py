@@ -26,6 +26,8 @@ from companion.sim.estimate_errors import EstimateErrors
 from companion.sim.flight_place import Place
 from companion.sim.flight_record import FlightRecord
 from companion.sim.flight_referee import Outcome, Rules
+from companion.sim.frame_faults import FrameFaults
+from companion.sim.image_effects import ImageEffects
 from companion.sim.vehicle import Vector3
 
 Method = Literal["paper", "off"]
@@ -70,6 +72,11 @@ class FlightSpec:
         After which a flight is a ``timeout``; None: as the world has it.
     estimate
         Errors of the autopilot's estimate.
+    image
+        What the camera does to its pictures: noise, vignetting, motion blur, brightness.
+    frame_drop_rate, frame_latency_s, frame_jitter_s
+        Share of frames that never come; from exposure to hand-over, and up to how much longer. In simulated time no
+        frame may take as long as it is to the next.
     """
 
     world: str = "room"
@@ -86,6 +93,10 @@ class FlightSpec:
     planner_hz: float = 20.0
     time_limit_s: float | None = None
     estimate: EstimateErrors = field(default_factory=EstimateErrors)
+    image: ImageEffects = field(default_factory=ImageEffects)
+    frame_drop_rate: float = 0.0
+    frame_latency_s: float = 0.0
+    frame_jitter_s: float = 0.0
 
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):
@@ -105,11 +116,25 @@ class FlightSpec:
             "detection_s": (0.0, 5.0),
             "planner_hz": (2.0, 200.0),
             "time_limit_s": (1.0, 3600.0),
+            "frame_drop_rate": (0.0, 1.0),
+            "frame_latency_s": (0.0, 2.0),
+            "frame_jitter_s": (0.0, 2.0),
         }
         for name, (least, most) in limits.items():
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
                 raise FlightError(f"{name}: found {value}; allowed: {least:g} to {most:g}")
+        longest_s = self.frame_latency_s + self.frame_jitter_s
+        if not self.realtime and longest_s >= 1.0 / self.frame_rate_hz:
+            raise FlightError(
+                f"frame_latency_s and frame_jitter_s: found {longest_s:g} together; allowed in simulated time: less "
+                f"than the {1.0 / self.frame_rate_hz:g} s between two frames"
+            )
+
+    @property
+    def frame_faults(self) -> FrameFaults:
+        """Which frames are lost or late."""
+        return FrameFaults(self.frame_drop_rate, self.frame_latency_s, self.frame_jitter_s, self.seed)
 
     def rules_for(self, place: Place) -> Rules:
         """Return when a flight there ends."""
@@ -122,7 +147,11 @@ class FlightSpec:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> FlightSpec:
         """Read what ``as_dict`` gave."""
-        return cls(**{**values, "estimate": EstimateErrors(**values["estimate"])})
+        parts = {
+            "estimate": EstimateErrors(**values["estimate"]),
+            "image": ImageEffects(**values["image"]),
+        }
+        return cls(**{**values, **parts})
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,4 +329,4 @@ def place_of(spec: FlightSpec) -> Place:
     """
     from companion.sim.flight_worlds import open_world
 
-    return open_world(spec.world)
+    return open_world(spec.world, seed=spec.seed, difficulty=spec.difficulty)

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, cast
 
 from companion.clock import Clock
 from companion.sim.autopilot import FakeAutopilot
+from companion.sim.camera_feed import Renderer
 from companion.sim.estimate_errors import ErringEstimate
 from companion.sim.flight import FlightError, FlightSpec
 from companion.sim.flight_place import Place
 from companion.sim.flight_record import FlightRecorder
 from companion.sim.flight_referee import Outcome, Referee
+from companion.sim.image_effects import ImageEffects
+from companion.sim.panda_camera import PandaCamera
 from companion.sim.planner import Planner, Waypoint
+from companion.sim.sensor_camera import SampledRenderer, SensorCamera
 from companion.sim.vehicle import Vehicle, VehicleLimits
+from detector.camera_model import CameraModel
 
 Address = tuple[str, int]
 
@@ -40,6 +47,27 @@ def service_tables(spec: FlightSpec, autopilot: Address) -> dict[str, dict[str, 
         "link": {"autopilot": "udpout:{}:{}".format(*autopilot)},
         "log": {"status_interval_s": 0.0, "detections": True},
     }
+
+
+def camera_model_of(spec: FlightSpec) -> CameraModel:
+    """Return the camera's size and lens."""
+    return CameraModel.from_hfov(spec.width_px, spec.height_px, spec.hfov_deg)
+
+
+def camera_of(spec: FlightSpec, place: Place) -> Callable[[], SensorCamera]:
+    """Return what makes the camera's view of a place; picklable, because the camera may be another process."""
+    return partial(_sensor_camera, place.renderer, spec.image, spec.seed, 1.0 / spec.frame_rate_hz)
+
+
+def _sensor_camera(
+    renderer: Callable[[], Renderer], effects: ImageEffects, seed: int, frame_period_s: float
+) -> SensorCamera:
+    made = renderer()
+    if not isinstance(made, PandaCamera):  # one whose samples cannot be chosen: no motion blur
+        effects = dataclasses.replace(effects, exposure_s=0.0)
+    return SensorCamera(
+        cast("SampledRenderer", made), effects=effects, seed=seed, frame_period_s=frame_period_s
+    )
 
 
 def goal_of(place: Place) -> Waypoint:

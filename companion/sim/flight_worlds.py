@@ -4,22 +4,36 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Final, cast
 
 from companion.sim.flight_place import Place
 from companion.sim.panda_camera import PandaCamera
 from companion.sim.world.clearance import Obstacles
 from companion.sim.world.file import load_world
 from companion.sim.world.model import World
+from companion.sim.world.random import Difficulty, random_world
+
+RANDOM: Final = "random"
+"""The world's name that asks for one drawn at random."""
 
 
-def open_world(name: str) -> Place:
-    """Return the place of a built-in world or of a world's file.
+def open_world(name: str, *, seed: int = 0, difficulty: str = "medium") -> Place:
+    """Return the place of a built-in world, of a world's file, or of one drawn at random.
+
+    Parameters
+    ----------
+    name
+        Of a built-in world; path of a file; or ``random``.
+    seed, difficulty
+        Of a random world.
 
     Raises
     ------
     companion.errors.ConfigError
         When there is no such world, or its file cannot be used.
     """
+    if name == RANDOM:
+        return place_in(random_world(seed, cast("Difficulty", difficulty)))  # which it checks
     return place_in(load_world(name))
 
 

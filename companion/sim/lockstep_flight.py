@@ -13,6 +13,8 @@ from companion.sim.flight import FlightSpec, FlownFlight
 from companion.sim.flight_loop import (
     Address,
     autopilot_of,
+    camera_model_of,
+    camera_of,
     goal_of,
     service_tables,
     take_off,
@@ -23,7 +25,6 @@ from companion.sim.flight_record import FlightRecorder
 from companion.sim.lockstep import LockstepLoop, run_lockstep
 from companion.sim.planner import Planner
 from companion.sim.stepped_camera import SteppedCamera
-from detector.camera_model import CameraModel
 
 _WORKER_START_S = 1.0
 """Simulated: it starts in no time."""
@@ -50,11 +51,12 @@ async def _fly(loop: LockstepLoop, spec: FlightSpec, place: Place) -> FlownFligh
         address: Address = autopilot.address
         if spec.method == "paper":
             camera = SteppedCamera(
-                place.renderer(),
-                CameraModel.from_hfov(spec.width_px, spec.height_px, spec.hfov_deg),
+                stack.enter_context(camera_of(spec, place)()),
+                camera_model_of(spec),
                 autopilot.true_pose,
                 clock=clock,
                 rate_hz=spec.frame_rate_hz,
+                faults=spec.frame_faults,
             )
 
             def on_event(event: Event) -> None:

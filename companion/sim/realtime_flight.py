@@ -22,6 +22,8 @@ from companion.sim.flight_loop import (
     Address,
     above_start,
     autopilot_of,
+    camera_model_of,
+    camera_of,
     goal_of,
     service_tables,
     take_off,
@@ -31,7 +33,6 @@ from companion.sim.flight_loop import (
 from companion.sim.flight_place import Place
 from companion.sim.flight_record import FlightRecorder
 from companion.sim.planner import Planner, Waypoint
-from detector.camera_model import CameraModel
 
 _WORKER_START_S = 90.0
 _CLIENT_START_S = 45.0
@@ -85,9 +86,14 @@ async def _started_service(
     spec: FlightSpec, place: Place, autopilot: FakeAutopilot, recorder: FlightRecorder, stack: AsyncExitStack
 ) -> CompanionProcess:
     """Start the camera and the service."""
-    camera = CameraModel.from_hfov(spec.width_px, spec.height_px, spec.hfov_deg)
     feed = await stack.enter_async_context(
-        CameraFeed(place.renderer, camera, autopilot.true_pose, rate_hz=spec.frame_rate_hz)
+        CameraFeed(
+            camera_of(spec, place),
+            camera_model_of(spec),
+            autopilot.true_pose,
+            rate_hz=spec.frame_rate_hz,
+            faults=spec.frame_faults,
+        )
     )
     tables = service_tables(spec, autopilot.address)
     tables["source"]["address"] = "{}:{}".format(*feed.address)

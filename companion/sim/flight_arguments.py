@@ -20,7 +20,7 @@ def add_flight_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--realtime", action="store_true", help="fly in real time instead of simulated time")
     parser.add_argument(
         "--size",
-        type=_size,
+        type=image_size,
         default=(default.width_px, default.height_px),
         metavar="WxH",
         help="of the camera's image in pixels (default: 320x240)",
@@ -69,7 +69,8 @@ def flight_spec(arguments: argparse.Namespace, *, world: str, seed: int, method:
     )
 
 
-def _size(text: str) -> tuple[int, int]:
+def image_size(text: str) -> tuple[int, int]:
+    """Return width and height of text such as ``320x240``; for argparse."""
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT such as 320x240, got {text!r}")

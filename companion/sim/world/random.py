@@ -28,6 +28,7 @@ from companion.sim.world.model import (
 from companion.sim.world.random_layout import FloorPlan, Layout, Ranges, draw_plan
 from companion.sim.world.random_things import Draft, Thing, draw_any, draw_tall
 from companion.sim.world.route import find_route
+from companion.sim.world.textures import PAINTINGS
 
 Difficulty = Literal["easy", "medium", "hard"]
 
@@ -54,11 +55,6 @@ _FLOORS: Final = (
 )
 _CEILINGS: Final = ("ceiling_tiles_1", "ceiling_tile_noborder_1", "concrete_1", "drywall_1")
 _DOORS: Final = ("door_steel_brown", "door_steel_grey", "door_steel_red")
-_PAINTINGS: Final = (
-    "antonello_messina1", "byron1", "cranach_lucas2", "felix_bonfils1", "francesco_hayez1", "gaston_bussiere1",
-    "george_henry_hall1", "giovanni_bellini1", "hans_holbein1", "jean-leon_gerome3", "julije_klovic1",
-    "kiprenskij_orest_adamovic1", "marie_bashkirtseff1", "paolo_veronese1", "richard_bergh1", "velazquez_diego1",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +204,7 @@ def _pictures(
                 bottom_m=round(rng.uniform(0.9, 1.2), 2),
                 width_m=width_m,
                 height_m=round(1.25 * width_m, 2),
-                texture=f"portraits/{_one_of(_PAINTINGS, rng)}",
+                texture=_one_of(PAINTINGS, rng),
             )
         pictures.append(picture)
         at_m += rng.uniform(1.6, 4.0)

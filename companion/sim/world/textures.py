@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-PORTRAIT_FOLDER: Final = "portraits/"
 PLAIN_PREFIX: Final = "plain:"
 _PLAIN = re.compile(r"plain:#[0-9a-fA-F]{6}")
 _PORTRAIT = re.compile(r"portraits/[a-z0-9_-]{1,80}")
@@ -58,6 +57,27 @@ TILE_SIDE_M: Final[Mapping[str, float]] = MappingProxyType(
     }
 )
 """Every texture that can cover a surface, with the side of the square that one copy of it covers, m."""
+
+
+PAINTINGS: Final = (
+    "portraits/antonello_messina1",
+    "portraits/byron1",
+    "portraits/cranach_lucas2",
+    "portraits/felix_bonfils1",
+    "portraits/francesco_hayez1",
+    "portraits/gaston_bussiere1",
+    "portraits/george_henry_hall1",
+    "portraits/giovanni_bellini1",
+    "portraits/hans_holbein1",
+    "portraits/jean-leon_gerome3",
+    "portraits/julije_klovic1",
+    "portraits/kiprenskij_orest_adamovic1",
+    "portraits/marie_bashkirtseff1",
+    "portraits/paolo_veronese1",
+    "portraits/richard_bergh1",
+    "portraits/velazquez_diego1",
+)
+"""Some of the wheel's paintings."""
 
 
 def checked_texture(name: str) -> str:

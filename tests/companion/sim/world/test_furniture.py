@@ -6,7 +6,7 @@ import pytest
 
 from companion.sim.world.file import builtin_worlds, load_world
 from companion.sim.world.furniture import MESHES, FurnitureKind
-from companion.sim.world.textures import TILE_SIDE_M, plain_colour_rgb, texture_file
+from companion.sim.world.textures import PAINTINGS, TILE_SIDE_M, plain_colour_rgb, texture_file
 
 
 def _wheel() -> Path:
@@ -46,7 +46,9 @@ def test_bounding_boxes_are_those_of_the_wheel() -> None:
 
 def test_every_texture_is_in_the_wheel() -> None:
     folder = _wheel() / "textures"
-    missing = [name for name in TILE_SIDE_M if not (folder / str(texture_file(name))).is_file()]
+    missing = [
+        name for name in (*TILE_SIDE_M, *PAINTINGS) if not (folder / str(texture_file(name))).is_file()
+    ]
     assert missing == []
 
 

@@ -10,7 +10,7 @@ from companion.sim.world.random import Difficulty, random_world
 from companion.sim.world.route import Route, find_route, point_route
 
 _MARGIN_M = {"easy": 0.2, "medium": 0.15, "hard": 0.05}
-_WORLDS = [("easy", 1), ("easy", 5), *(("medium", seed) for seed in range(8)), ("hard", 2), ("hard", 3)]
+_WORLDS = [("easy", 1), ("easy", 5), *(("medium", seed) for seed in range(5)), ("hard", 2), ("hard", 3)]
 
 
 def _blocked(world: World) -> bool:
@@ -54,10 +54,8 @@ def test_harder_worlds_are_narrower() -> None:
         assert "bends" in about
         return float(about.split(" of ")[1].split(" m")[0])
 
-    bends = [seed for seed in range(12) if "bends" in random_world(seed, "easy").description][:2]
-    assert bends
-    for seed in bends:
-        assert corridor_m(seed, "easy") >= 2.2
+    for seed in (4, 5):  # the floor plan's kind is the seed's, whatever the difficulty
+        assert 2.2 <= corridor_m(seed, "easy") <= 3.0
         assert 1.8 <= corridor_m(seed, "hard") <= 2.6
 
 

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import cast, get_args
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -145,13 +144,18 @@ def _ended_like_ctrl_c() -> Iterator[None]:
 
 
 def _print(finished: tuple[Finished, ...], folder: Path) -> None:
-    table = Table(title=f"{len(finished)} flights; more in {folder}", title_justify="left", box=SIMPLE_HEAD)
+    console = Console()
+    console.print(
+        f"{len(finished)} flights; more in {folder}:", soft_wrap=True, markup=False, highlight=False
+    )
+    # Narrow, so that a terminal of 80 columns has room for it.
+    table = Table(box=None, pad_edge=False, collapse_padding=True)
     for head in ("world", "method", "flights", *OUTCOME_HEADS, "succeeded"):
         table.add_column(head, justify="left" if head in ("world", "method") else "right")
     for row in rows_of(finished):
         cells = (row.world, row.method, row.flights, *row.outcomes, row.succeeded)
         table.add_row(*(str(cell) for cell in cells))
-    Console().print(table)
+    console.print(table)
 
 
 def _seeds(text: str) -> tuple[int, ...]:

@@ -23,7 +23,7 @@ Image = NDArray[np.uint8]
 TILE_PX: Final = 240
 _LABEL_PX: Final = 34
 _EDGE_PX: Final = 8
-_LARGEST_SIDE_PX: Final = 16_000
+LARGEST_SIDE_PX: Final = 10_000
 _TRIAL_PX_PER_M: Final = 20.0
 
 _INK: Final[Colour] = (40, 40, 40)
@@ -66,22 +66,20 @@ def write_sheet(finished: Sequence[Finished], path: Path, world_of: Callable[[Pl
         raise SuiteError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def sheet(tiles: Sequence[Image]) -> Image:
-    """Return tiles of one size side by side in rows, in their order."""
+def sheet(tiles: Sequence[Image], *, largest_side_px: int = LARGEST_SIDE_PX) -> Image:
+    """Return tiles of one size side by side in rows, in their order; smaller where the picture would be too large."""
     if not tiles:
         raise ValueError("a sheet needs at least one tile")
-    height_px, width_px = tiles[0].shape[:2]
-    columns = max(1, min(math.ceil(math.sqrt(1.5 * len(tiles))), len(tiles)))
+    columns = min(math.ceil(math.sqrt(1.5 * len(tiles))), len(tiles))
     rows = math.ceil(len(tiles) / columns)
+    height_px, width_px = tiles[0].shape[:2]
+    factor = min(1.0, largest_side_px / max(rows * height_px, columns * width_px))
+    height_px, width_px = math.floor(height_px * factor), math.floor(width_px * factor)
     picture = np.full((rows * height_px, columns * width_px, 3), 255, dtype=np.uint8)
-    for index, tile in enumerate(tiles):
+    for index, whole in enumerate(tiles):
         top, left = index // columns * height_px, index % columns * width_px
-        picture[top : top + height_px, left : left + width_px] = tile
-    if (largest := max(picture.shape)) > _LARGEST_SIDE_PX:  # more than some thousand flights
-        factor = _LARGEST_SIDE_PX / largest
-        picture = np.asarray(
-            cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8
-        )
+        small = cv2.resize(whole, (width_px, height_px), interpolation=cv2.INTER_AREA)
+        picture[top : top + height_px, left : left + width_px] = small
     return picture
 
 

@@ -184,6 +184,21 @@ def test_a_suite_flown_on_a_cluster_is_kept_like_any_other(cluster, tmp_path):
     assert [flight.outcome for flight in finished] == ["reached", "failed simulation", "reached"]
 
 
+@pytest.mark.slow
+def test_a_real_flight_on_a_worker_brings_its_record_back(cluster):
+    wall = "{ from_m = [0, 0], to_m = [4, 0] }"
+    text = (
+        "name = 'hall'\nstart = { north_m = 2, east_m = 2 }\n"
+        f"goal = {{ north_m = 4, east_m = 2 }}\nwalls = [{wall}]\n"
+    )
+    flight = PlannedFlight("hall", FlightSpec(world="hall.toml", method="off"), text)
+    ((_, ending),) = fly_on_cluster([flight], scheduler=cluster.scheduler_address)
+    assert ending.error is None, ending.log
+    assert ending.succeeded
+    assert ending.result["outcome"] == "reached"
+    assert ending.record.startswith(b"PK")  # a zip, as npz is
+
+
 def test_a_worker_that_goes_down_takes_its_own_flight_only(cluster):
     endings = dict(fly_on_cluster(FLIGHTS, scheduler=cluster.scheduler_address, fly=deadly))
     assert [endings[flight].error is None for flight in FLIGHTS] == [True, False, True]

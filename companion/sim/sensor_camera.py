@@ -33,6 +33,44 @@ class SampledRenderer(Protocol):
         ...
 
 
+def photograph(
+    renderer: SampledRenderer,
+    camera: CameraModel,
+    position_ned_m: ArrayLike,
+    r_ned_from_camera: ArrayLike,
+    motion: CameraMotion,
+    effects: ImageEffects,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """Return one picture by a real camera, (height_px, width_px) uint8.
+
+    Parameters
+    ----------
+    renderer
+        Makes the ideal pictures.
+    camera
+        Size and lens.
+    position_ned_m, r_ned_from_camera
+        (3,) and (3, 3): the pose in the middle of the exposure.
+    motion
+        While the shutter is open.
+    effects
+        What the sensor does.
+    rng
+        Draws the noise.
+    """
+    frames: tuple[SubFrame, ...] = ()
+    if effects.exposure_s > 0.0:
+        frames = sub_frames(motion.blur_px(camera, effects.exposure_s), effects.exposure_s)
+    if not frames:
+        return sensed(renderer.render(camera, position_ned_m, r_ned_from_camera), effects, rng)
+
+    def rendered(position: ArrayLike, rotation: ArrayLike, frame: SubFrame) -> NDArray[np.uint8]:
+        return renderer.render(camera, position, rotation, supersample=1, shift_px=frame.shift_px)
+
+    return sensed(exposed(rendered, position_ned_m, r_ned_from_camera, motion, frames), effects, rng)
+
+
 class SensorCamera:
     """Adds a sensor's effects to a renderer; satisfies ``companion.sim.camera_feed.Renderer``.
 
@@ -102,27 +140,10 @@ class SensorCamera:
         """Return the next frame, (height_px, width_px) uint8, from the pose in the middle of its exposure."""
         position = np.asarray(position_ned_m, dtype=np.float64)
         rotation = np.asarray(r_ned_from_camera, dtype=np.float64)
-        frames: tuple[SubFrame, ...] = ()
         motion = self._motion_to(position, rotation)
-        if self._effects.exposure_s > 0.0:
-            exposure_s = self._effects.exposure_s
-            frames = sub_frames(motion.blur_px(camera, exposure_s), exposure_s)
-        light: NDArray[np.float32] | NDArray[np.uint8]
-        if frames:
-            light = exposed(
-                lambda p, r, frame: self._renderer.render(
-                    camera, p, r, supersample=1, shift_px=frame.shift_px
-                ),
-                position,
-                rotation,
-                motion,
-                frames,
-            )
-        else:
-            light = self._renderer.render(camera, position, rotation)
         rng = np.random.default_rng([self._seed, self._frame])
         self._frame += 1
-        return sensed(light, self._effects, rng)
+        return photograph(self._renderer, camera, position, rotation, motion, self._effects, rng)
 
     def _motion_to(self, position: NDArray[np.float64], rotation: NDArray[np.float64]) -> CameraMotion:
         last, self._last = self._last, (position.copy(), rotation.copy())

@@ -42,17 +42,15 @@ def suite(folder: Path, *words: str) -> list[str]:
 
 @pytest.mark.slow
 def test_flights_are_flown_reported_and_not_flown_again(tmp_path, capsys):
-    words = suite(tmp_path, "--seeds", "5..6", "-j", "2", "--json")
+    words = suite(tmp_path, "--seeds", "5", "-j", "2", "--json")
     assert main(words) == 0
     first = json.loads(capsys.readouterr().out)
     assert [(flight["name"], flight["outcome"], flight["succeeded"]) for flight in first["flights"]] == [
         ("open-s5-off", "reached", True),
-        ("open-s6-off", "reached", True),
         ("blocked-s5-off", "collided", False),
-        ("blocked-s6-off", "collided", False),
     ]
     out = tmp_path / "out"
-    assert "| open.toml | off | 2 | 2 | 0 | 0 | 0 | 0 | 2 |" in (out / "suite.md").read_text()
+    assert "| open.toml | off | 1 | 1 | 0 | 0 | 0 | 0 | 1 |" in (out / "suite.md").read_text()
     assert json.loads((out / "suite.json").read_text()) == first
     assert cv2.imread(str(out / "sheet.png")).any()
     record = FlightRecord.load(out / first["flights"][0]["record"])

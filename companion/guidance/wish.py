@@ -243,8 +243,9 @@ def _as_velocity(
         decision.down_m is None
     ):  # it moves on: the planner's speed, as far as the step reaches within the horizon
         planned_m_s = math.hypot(setpoint.vx, setpoint.vy)
-        speed_m_s = min(planned_m_s, cap_m_s, distance_m / config.velocity_horizon_s)
+        speed_m_s = min(planned_m_s, distance_m / config.velocity_horizon_s)
     else:  # back to the place that is held, or a probe
+        cap_m_s = config.max_step_m / config.velocity_horizon_s
         speed_m_s = min(_HOLD_SPEED_M_S, cap_m_s, _HOLD_GAIN_HZ * distance_m)
     scale = speed_m_s / distance_m if distance_m > 0.0 else 0.0
     vx, vy = _to_frame(scale * north_m, scale * east_m, reading, heading)

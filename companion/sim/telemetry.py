@@ -6,6 +6,7 @@ Rates are those measured on PX4 v1.16.1's companion link. https://mavlink.io/en/
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -20,6 +21,9 @@ _ORIGIN_LAT_DEG, _ORIGIN_LON_DEG = 47.397742, 8.545594
 ORIGIN_ALT_M = 488.0
 """Altitude of the origin of local NED."""
 _NAN = float("nan")
+
+CURRENT_MODE = 436
+_CURRENT_MODE_CRC_EXTRA = 193
 
 _SENSORS = (
     mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -111,6 +115,28 @@ def _system_status(s: Snapshot) -> int:
     """PX4 is active when armed, ArduPilot when it flies."""
     active = s.landed is not LandedState.ON_GROUND if s.is_ardupilot else s.armed
     return int(mavlink.MAV_STATE_ACTIVE if active else mavlink.MAV_STATE_STANDBY)
+
+
+class _CurrentModeMessage:
+    """CURRENT_MODE, which pymavlink 2.4.50's dialect lacks; packs itself as one of its messages does."""
+
+    def __init__(self, custom_mode: int) -> None:
+        self._payload = struct.pack("<IIB", custom_mode, custom_mode, 0).rstrip(b"\0") or b"\0"
+
+    def get_type(self) -> str:
+        """Return the message's name."""
+        return "CURRENT_MODE"
+
+    def pack(self, encoder: Any) -> bytes:
+        """Return the frame with the encoder's sequence number and sender."""
+        header = [len(self._payload), 0, 0, encoder.seq, encoder.srcSystem, encoder.srcComponent]
+        covered = bytes(header) + CURRENT_MODE.to_bytes(3, "little") + self._payload
+        crc = mavlink.x25crc(covered + bytes([_CURRENT_MODE_CRC_EXTRA])).crc
+        return bytes([mavlink.PROTOCOL_MARKER_V2]) + covered + int(crc).to_bytes(2, "little")
+
+
+def _current_mode(s: Snapshot) -> _CurrentModeMessage:
+    return _CurrentModeMessage(s.mode.custom_mode)
 
 
 def _attitude(s: Snapshot) -> Any:
@@ -334,6 +360,7 @@ STREAMS: dict[int, Stream] = {
         Stream(mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 30.0, _local_position_ned),
         Stream(mavlink.MAVLINK_MSG_ID_ODOMETRY, 30.0, _odometry),
         Stream(mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED, 10.0, _position_target_local_ned),
+        Stream(CURRENT_MODE, 0.5, _current_mode),
         Stream(mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 5.0, _extended_sys_state),
         Stream(mavlink.MAVLINK_MSG_ID_SYS_STATUS, 5.0, _sys_status),
         Stream(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 50.0, _global_position_int),

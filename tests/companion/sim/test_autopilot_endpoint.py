@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.mavlink import telemetry
+from companion.mavlink.framing import Framer
 from companion.sim.autopilot_endpoint import AutopilotEndpoint
 from companion.sim.flight_controller import FlightController
 from companion.sim.parameters import ParameterTable
@@ -33,7 +35,9 @@ class Bench:
         self._reader = FrameReader()
 
     def decode(self, frames: list[bytes]) -> list[Any]:
-        return [frame.message for raw in frames for frame in self._reader.read(raw)]
+        """The messages that the dialect knows."""
+        found = [frame.message for raw in frames for frame in self._reader.read(raw)]
+        return [message for message in found if message is not None]
 
     def send(self, message: Any) -> list[Any]:
         return self.decode(self.endpoint.receive(self.writer.pack(message), self.now_ns))
@@ -104,6 +108,24 @@ def test_the_heartbeat_says_px4_mode_and_arming() -> None:
     assert beats[-1].autopilot == 12
     assert beats[-1].base_mode == 145
     assert mode_from_custom(beats[-1].custom_mode) is FlightMode.OFFBOARD
+
+
+def test_current_mode_comes_every_two_seconds_and_as_often_as_it_is_asked_for() -> None:
+    bench = offboard()
+    reader = Framer()
+
+    def modes(seconds: float) -> list[int]:
+        before = len(bench.endpoint.sent_frames)
+        bench.run(seconds, x=0.0, y=0.0, z=-2.0)
+        frames = reader.feed(b"".join(bench.endpoint.sent_frames[before:]))
+        found = [telemetry.decode(f) for f in frames if f.message_id == 436 and f.verified]
+        return [m.custom_mode for m in found if isinstance(m, telemetry.CurrentMode)]
+
+    assert modes(4) == [FlightMode.OFFBOARD.custom_mode] * 2
+    assert bench.command(511, 436, 50_000)[0].result == 0
+    assert len(modes(1)) == pytest.approx(20, abs=1)
+    bench.command(176, 1, 4, 3)
+    assert set(modes(0.2)) == {FlightMode.HOLD.custom_mode}
 
 
 def test_offboard_is_refused_without_a_stream_and_kept_with_one() -> None:

@@ -45,6 +45,17 @@ class YawSlew:
 
     def toward(self, yaw_rad: float, pose: Pose, now_ns: int) -> float:
         """Return the next yaw on the way to ``yaw_rad``."""
+        start, cap = self._start(pose, now_ns)
+        return wrap_rad(start + max(-cap, min(cap, wrap_rad(yaw_rad - start))))
+
+    def turning(self, rate_rad_s: float, pose: Pose, now_ns: int) -> float:
+        """Return the next yaw of a turn at the planner's rate, or at the capped one where that is slower."""
+        start, cap = self._start(pose, now_ns)
+        step = cap * rate_rad_s / self._rate_rad_s
+        return wrap_rad(start + max(-cap, min(cap, step)))
+
+    def _start(self, pose: Pose, now_ns: int) -> tuple[float, float]:
+        """Return the yaw to go on from, and how far it may go by now."""
         heading = heading_rad(pose.q_ned_from_body)
         since_ns = now_ns - self._at_ns
         start = heading
@@ -54,8 +65,7 @@ class YawSlew:
         # A planner of 1-2 Hz is slow, not new: it turns too. After a longer pause the first step is none.
         paused = since_ns > self._paused_after_s * 1e9
         dt_s = 0.0 if paused else min(since_ns / 1e9, _MAX_SLEW_DT_S)
-        cap = self._rate_rad_s * dt_s
-        return wrap_rad(start + max(-cap, min(cap, wrap_rad(yaw_rad - start))))
+        return start, self._rate_rad_s * dt_s
 
 
 class Command:
@@ -141,6 +151,8 @@ class Command:
                     wanted_yaw = wish.yaw_rad
         whole_step = step_m >= s.goal_m
         slewed = None if wanted_yaw is None else self.yaw.toward(wanted_yaw, s.pose, s.now_ns)
+        if self._steers_by_rate(s) and wish.yaw_rate_rad_s is not None:
+            wanted_yaw = slewed = self.yaw.turning(wish.yaw_rate_rad_s, s.pose, s.now_ns)
         if whole_step and self._may_pass(s, slewed):
             passes = heading_rad(s.pose.q_ned_from_body) if wish.yaw_rad is None else wish.yaw_rad
             self.yaw.commanded(passes, s.now_ns)
@@ -152,6 +164,12 @@ class Command:
             y = s.pose.east_m + step_m * math.sin(s.bearing_rad)
         down_m = None if s.reached or step_m > 0.0 else s.pose.down_m
         return self._rewrite(x, y, wanted_yaw, "substituted", s, down_m=down_m, slewed=slewed)
+
+    def _steers_by_rate(self, s: Situation) -> bool:
+        """Whether the planner turns the vehicle by a yaw rate: on the spot, or a goal that turns along."""
+        if s.wish.yaw_rad is not None or s.wish.yaw_rate_rad_s is None:
+            return False
+        return s.reached or s.wish.body_bearing_rad is not None
 
     def _free_to_goal_m(self, s: Situation) -> float | None:
         """Return the free distance toward the goal, where anything is known of it."""

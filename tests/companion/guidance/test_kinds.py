@@ -125,6 +125,36 @@ def test_a_velocity_of_zero_passes_and_the_smallest_one_does_not():
     assert offset.n == 0.0
 
 
+@pytest.mark.parametrize(("autopilot", "frame"), [(PX4, 8), (ARDUPILOT, 8), (ARDUPILOT, 9)])
+@pytest.mark.parametrize(("rate", "expected_deg_s"), [(0.2, 11.46), (-0.2, -11.46), (2.0, 30.0)])
+def test_a_planner_that_steers_by_yaw_rate_flies_curves_at_the_capped_rate(
+    autopilot, frame, rate, expected_deg_s
+):
+    flight = WireFlight(HALL, autopilot=autopilot)
+    curve = local(1479, frame, v=(0.5, 0.0, 0.0), rate=rate)
+    flight.stream(curve, 4)
+    before, turned = flight.yaw, 0.0
+    for _ in range(60):
+        flight.send(curve)
+        turned, before = turned + wrap_rad(flight.yaw - before), flight.yaw
+        assert abs(wrap_rad(math.atan2(flight.ve, flight.vn) - flight.yaw)) < 0.6, "it flies where it looks"
+    assert flight.state is State.FOLLOW
+    assert math.degrees(turned) / 3.0 == pytest.approx(expected_deg_s, rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [0.3, 3.0])
+def test_turning_on_the_spot_by_rate_is_granted_up_to_the_cap(rate):
+    flight = WireFlight(HALL)
+    flight.stream(local(1479, 8, rate=rate), 1)
+    start, last = 0.0, flight.yaw
+    for _ in range(60):
+        verdict = flight.send(local(1479, 8, rate=rate))
+        start, last = start + wrap_rad(flight.yaw - last), flight.yaw
+    assert isinstance(verdict, Forward) == (rate < math.radians(30))
+    assert start / 3.0 == pytest.approx(min(rate, math.radians(30)), rel=0.1)
+    assert math.hypot(flight.n, flight.e) < 0.01
+
+
 # ---------------------------------------------------------------- what is configured
 
 

@@ -249,13 +249,24 @@ def run_flight(spec: FlightSpec, place: Place | None = None, *, record: Path | N
     companion.errors.CompanionError
         When the world cannot be used or the simulation itself failed.
     """
-    place = place if place is not None else place_of(spec)
+    result, kept = fly_and_judge(spec, place if place is not None else place_of(spec))
+    if record is not None:
+        kept.save(record)
+    return result
+
+
+def fly_and_judge(spec: FlightSpec, place: Place) -> tuple[FlightResult, FlightRecord]:
+    """Fly, and return the result and the record, which knows both (``about``).
+
+    Raises
+    ------
+    companion.errors.CompanionError
+        When the simulation itself failed.
+    """
     flown = fly(spec, place)
     result = judged(spec, place, flown)
-    if record is not None:
-        about = {"spec": spec.as_dict(), "result": result.as_dict()}
-        dataclasses.replace(flown.record, about=about).save(record)
-    return result
+    about = {"spec": spec.as_dict(), "result": result.as_dict()}
+    return result, dataclasses.replace(flown.record, about=about)
 
 
 def fly(spec: FlightSpec, place: Place) -> FlownFlight:
@@ -327,6 +338,6 @@ def place_of(spec: FlightSpec) -> Place:
     companion.errors.CompanionError
         When there is no such world, or its file cannot be used.
     """
-    from companion.sim.flight_worlds import open_world
+    from companion.sim.flight_worlds import find_world, place_in
 
-    return open_world(spec.world, seed=spec.seed, difficulty=spec.difficulty)
+    return place_in(find_world(spec.world, seed=spec.seed, difficulty=spec.difficulty))

@@ -17,8 +17,8 @@ RANDOM: Final = "random"
 """The world's name that asks for one drawn at random."""
 
 
-def open_world(name: str, *, seed: int = 0, difficulty: str = "medium") -> Place:
-    """Return the place of a built-in world, of a world's file, or of one drawn at random.
+def find_world(name: str, *, seed: int = 0, difficulty: str = "medium") -> World:
+    """Return a built-in world, a file's world, or one drawn at random.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ def open_world(name: str, *, seed: int = 0, difficulty: str = "medium") -> Place
         When there is no such world, or its file cannot be used.
     """
     if name == RANDOM:
-        return place_in(random_world(seed, cast("Difficulty", difficulty)))  # which it checks
-    return place_in(load_world(name))
+        return random_world(seed, cast("Difficulty", difficulty))  # which it checks
+    return load_world(name)
 
 
 def place_in(world: World) -> Place:

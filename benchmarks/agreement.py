@@ -288,10 +288,12 @@ def markdown(result: dict) -> str:
     for name, row in [*result["sets"].items(), ("**all**", result["all"])]:
         cells = [f"{row[key]['fast']:.2f}, {row[key]['literal_itself']:.2f}" for key in ("kind", "answer")]
         low, high = row["answer"]["interval"] or (math.nan, math.nan)
-        directions = f"{row['direction']['fast']:.2f}, {row['direction']['literal_itself']:.2f}"
+        of = row["direction"]
+        directions = f"{of['fast']:.2f}, {of['literal_itself']:.2f} (of {of['pairs_fast']})"
+        directions = directions if of["pairs_fast"] else "-"
         lines.append(
             f"| {name} | {row['pairs']} | {cells[0]} | {cells[1]} | {row['answer']['difference']:+.3f} "
-            f"({low:+.3f} .. {high:+.3f}) | {directions} (of {row['direction']['pairs_fast']}) |"
+            f"({low:+.3f} .. {high:+.3f}) | {directions} |"
         )
     lines += ["", f"| where they differ: fast, {other} | cases |", "|---|---|"]
     lines += [

@@ -27,10 +27,11 @@ from rich.table import Table
 
 from companion.clock import RealClock
 from companion.errors import CompanionError
+from companion.sim.annotated_video import Story
 from companion.sim.autopilot import FakeAutopilot
 from companion.sim.camera_feed import CameraFeed
 from companion.sim.companion_process import CompanionProcess, CompanionProcessError, Event
-from companion.sim.demo_video import FootageVideo, RoomVideo, Story
+from companion.sim.demo_video import FootageVideo, RoomVideo
 from companion.sim.footage import OFFICE_WALK, OFFICE_WALK_CAMERA, OFFICE_WALK_POSES
 from companion.sim.planner import Planner, Waypoint
 from companion.sim.recorded_poses import RecordedPoses

@@ -12,8 +12,12 @@ from typing import Any, get_args
 from rich.console import Console
 from rich.table import Table
 
-from companion.sim.flight import FlightResult, FlightSpec, Method, run_flight
+from companion.sim.flight import FlightResult, FlightSpec, Method, fly_and_judge
 from companion.sim.flight_arguments import add_flight_arguments, flight_spec
+from companion.sim.flight_loop import camera_model_of
+from companion.sim.flight_video import write_flight_video
+from companion.sim.flight_worlds import find_world, place_in
+from companion.sim.pairs import add_pairs_parser
 from companion.sim.suite_command import add_suite_parser
 
 _DESCRIPTION = """\
@@ -27,7 +31,9 @@ def sim_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="companion sim", description=_DESCRIPTION, allow_abbrev=False)
     _add_arguments(parser)
     parser.set_defaults(command=_fly, parser=parser)
-    add_suite_parser(parser.add_subparsers(title="many flights", metavar="suite"))
+    commands = parser.add_subparsers(title="more", metavar="suite | pairs")
+    add_suite_parser(commands)
+    add_pairs_parser(commands)
     return parser
 
 
@@ -42,6 +48,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="paper: the service with its default preset; off: no service, the planner speaks to the autopilot",
     )
     add_flight_arguments(parser)
+    parser.add_argument("--video", type=Path, metavar="OUT.mp4", help="write an annotated video")
     parser.add_argument("--record", type=Path, metavar="OUT.npz", help="write everything that was recorded")
     parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
 
@@ -50,7 +57,12 @@ def _fly(arguments: argparse.Namespace) -> int:
     if arguments.world is None:
         arguments.parser.error("--world is needed: the name of a built-in world, a world file, or random")
     spec = flight_spec(arguments, world=arguments.world, seed=arguments.seed, method=arguments.method)
-    result = run_flight(spec, record=arguments.record)
+    world = find_world(spec.world, seed=spec.seed, difficulty=spec.difficulty)
+    result, record = fly_and_judge(spec, place_in(world))
+    if arguments.record is not None:
+        record.save(arguments.record)
+    if arguments.video is not None:
+        write_flight_video(record, world, camera_model_of(spec), arguments.video)
     if arguments.json:
         sys.stdout.write(json.dumps(result.as_dict()) + "\n")
     else:

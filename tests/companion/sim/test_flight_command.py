@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import pytest
 
 from companion.cli import main
@@ -45,6 +46,15 @@ def test_a_flight_prints_one_json_object_with_the_promised_keys_and_keeps_its_re
     kept = FlightRecord.load(record)
     assert kept.about["result"]["path_m"] == result["path_m"]
     assert kept.duration_s == pytest.approx(result["time_s"], abs=0.01)
+
+
+def test_a_video_is_written_where_it_is_asked_for(tmp_path, capsys):
+    video = tmp_path / "flight.mp4"
+    assert main(["sim", "--world", box(tmp_path), "--method", "off", "--video", str(video)]) == 0
+    assert "reached" in capsys.readouterr().out
+    frames = cv2.VideoCapture(str(video))
+    assert frames.read()[0]
+    frames.release()
 
 
 def test_the_exit_code_is_0_also_for_a_collision(tmp_path, capsys):

@@ -67,7 +67,8 @@ class Ending:
     succeeded
         Whether it ended at the goal, or without a collision in a world where nothing leads there.
     error
-        Why the simulation failed, one line; None where it did not.
+        Why the simulation failed, or why a flight that it did to its end has no video; one line. None where
+        nothing went wrong.
     record, video
         The files' contents, where there are such files.
     log

@@ -71,16 +71,19 @@ class FlightProcesses:
             with (folder / "log").open("wb") as log:
                 error = self._run(folder, log.fileno())
             text = _tail(folder / "log")
-            answer = None if error else _answer(folder / "result.json")
+            answer = _answer(folder / "result.json")
             if answer is None:
                 return Ending(error=error or "the simulation ended without a result", log=text)
-            if "error" in answer:
-                return Ending(error=answer["error"], log=text)
+            error = error or answer.get("error")
+            if "result" not in answer:
+                return Ending(error=error, log=text)
             return Ending(
                 result=answer["result"],
                 succeeded=answer["succeeded"],
+                error=error,
                 record=_bytes(folder / "record.npz"),
-                video=_bytes(folder / "video.mp4"),
+                # What went wrong after the flight went wrong with its video.
+                video=None if error else _bytes(folder / "video.mp4"),
                 log=text,
             )
 

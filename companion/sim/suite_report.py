@@ -115,7 +115,7 @@ def report_json(finished: Sequence[Finished], folder: Path) -> str:
 
 
 def report_markdown(finished: Sequence[Finished], folder: Path) -> str:
-    """Return the tables of a suite as Markdown: by world and method, then every flight, then failed simulations."""
+    """Return the tables of a suite as Markdown: by world and method, then every flight, then what went wrong."""
     parts = [
         "# Simulated flights\n",
         _table(
@@ -142,8 +142,8 @@ def report_markdown(finished: Sequence[Finished], folder: Path) -> str:
             (_flight_cells(flight, folder) for flight in finished),
         ),
     ]  # fmt: skip
-    if failed := [flight for flight in finished if flight.result is None]:
-        parts.append("## Failed simulations\n")
+    if failed := [flight for flight in finished if flight.error is not None]:
+        parts.append("## What went wrong with the simulation\n")
         parts.append("".join(f"- {flight.flight.name}: {flight.error}\n" for flight in failed))
     return "\n".join(parts)
 

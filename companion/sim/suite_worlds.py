@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import cast
-
+from companion.sim.flight_worlds import find_world
 from companion.sim.suite import PlannedFlight
-from companion.sim.world.file import load_world, parse_world
+from companion.sim.world.file import parse_world
 from companion.sim.world.model import World
-from companion.sim.world.random import Difficulty, random_world
 
 
 def world_of(flight: PlannedFlight) -> World:
@@ -21,6 +19,4 @@ def world_of(flight: PlannedFlight) -> World:
     spec = flight.spec
     if flight.world_toml is not None:
         return parse_world(flight.world_toml, name=spec.world)
-    if spec.world == "random":
-        return random_world(spec.seed, cast(Difficulty, spec.difficulty))  # which it checks
-    return load_world(spec.world)
+    return find_world(spec.world, seed=spec.seed, difficulty=spec.difficulty)

@@ -53,8 +53,13 @@ def test_flights_are_flown_reported_and_not_flown_again(tmp_path, capsys):
     assert "| open.toml | off | 1 | 1 | 0 | 0 | 0 | 0 | 1 |" in (out / "suite.md").read_text()
     assert json.loads((out / "suite.json").read_text()) == first
     assert cv2.imread(str(out / "sheet.png")).any()
-    record = FlightRecord.load(out / first["flights"][0]["record"])
-    assert record.about["result"]["path_m"] == first["flights"][0]["result"]["path_m"]
+    reached, collided = first["flights"]
+    assert reached["video"] is None
+    video = cv2.VideoCapture(str(out / collided["video"]))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == pytest.approx(10 * collided["result"]["time_s"], abs=2)
+    video.release()
+    record = FlightRecord.load(out / reached["record"])
+    assert record.about["result"]["path_m"] == reached["result"]["path_m"]
 
     flown = {path: path.stat().st_mtime_ns for path in (out / "flights").iterdir()}
     assert main(words[:-1]) == 0

@@ -82,6 +82,14 @@ def test_a_simulation_that_fails_says_why(body, error):
     assert (ending.result, ending.error) == (None, error)
 
 
+@pytest.mark.parametrize("rest", ["os.abort()", "time.sleep(600)", "sys.exit(2)"])
+def test_a_flight_that_was_flown_counts_even_when_its_video_fails(rest):
+    body = f"(folder / 'record.npz').write_bytes(b'r'); (folder / 'video.mp4').write_bytes(b'half'); finish(); {rest}"
+    ending = fly(body, time_limit_s=1.0)
+    assert (ending.result, ending.record, ending.video) == ({"outcome": "reached"}, b"r", None)
+    assert ending.error is not None
+
+
 def test_the_log_of_a_failed_simulation_comes_back():
     assert "first" in fly("print('first', flush=True); raise RuntimeError('boom')").log
 

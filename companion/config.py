@@ -11,6 +11,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+_LEAST_HORIZON_S = 0.5
+"""No autopilot stops sooner after the last velocity."""
+
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
@@ -287,11 +290,11 @@ class GuidanceConfig(_Section):
     velocity_horizon_s: Annotated[
         float,
         Field(
-            ge=0.5,
+            ge=0,
             le=10,
-            description="How far a velocity reaches counts as its step: the speed is at most max_step_m, or the free distance less its margin, in this time (s). At least what the autopilot needs to stop by itself when setpoints end: PX4 1.2, ArduPilot 4.1 (GUID_TIMEOUT 3). Larger: slower.",
+            description="How far a velocity reaches counts as its step: the speed is at most max_step_m, or the free distance less its margin, in this time (s). It is what the autopilot needs to stop by itself when setpoints end. 0: as measured with its default parameters, PX4 1.5 s (COM_OF_LOSS_T 1.0), ArduPilot 4.1 s (GUID_TIMEOUT 3). Larger: slower.",
         ),
-    ] = 1.5
+    ] = 0.0
     step_margin_m: Annotated[
         float,
         Field(ge=0, le=5, description="Kept between the end of a step and the nearest thing seen there (m)."),
@@ -462,6 +465,14 @@ class GuidanceConfig(_Section):
         found: list[Disagreement] = []
         if self.wall_k > self.wall_n:
             found.append(Disagreement("wall_k", str(self.wall_k), f"at most wall_n, which is {self.wall_n}"))
+        if 0.0 < self.velocity_horizon_s < _LEAST_HORIZON_S:
+            found.append(
+                Disagreement(
+                    "velocity_horizon_s",
+                    str(self.velocity_horizon_s),
+                    f"0 (the autopilot's own), or from {_LEAST_HORIZON_S} to 10",
+                )
+            )
         if self.detection_max_age_s > self.detection_max_age_hover_s:
             found.append(
                 Disagreement(

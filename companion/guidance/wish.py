@@ -39,6 +39,9 @@ _AHEAD_STEPS = 2.0
 _HOLD_GAIN_HZ = 0.5
 """Speed toward a held place for each metre away from it. Well below what pose and vehicle lag by (about 1 s)."""
 _HOLD_SPEED_M_S = 0.5
+_PX4_STOPS_S = 1.5
+_ARDUPILOT_STOPS_S = 4.1
+"""From the last velocity to standing still, with default parameters: the mode is left after 1.15 s, then it brakes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +204,13 @@ def express(
         case Motion.OFFSET:
             return _as_offset(decision, reading, pose)
         case Motion.VELOCITY:
-            return _as_velocity(decision, setpoint, reading, pose, config)
+            horizon_s = config.velocity_horizon_s or stops_by_itself_s(autopilot)
+            return _as_velocity(decision, setpoint, reading, pose, config.max_step_m / horizon_s, horizon_s)
+
+
+def stops_by_itself_s(autopilot: Autopilot) -> float:
+    """Return how long a velocity outlives the last setpoint, braking included, with the autopilot's default parameters."""
+    return _PX4_STOPS_S if autopilot is Autopilot.PX4 else _ARDUPILOT_STOPS_S
 
 
 def _as_position(
@@ -231,21 +240,19 @@ def _as_velocity(
     setpoint: Setpoint,
     reading: Reading,
     pose: Pose | None,
-    config: GuidanceConfig,
+    cap_m_s: float,
+    horizon_s: float,
 ) -> Verdict:
     if isinstance(decision, Stay) or pose is None:
         return RewriteVelocity(0.0, 0.0, None, decision.action)
     heading = heading_rad(pose.q_ned_from_body)
     north_m, east_m = decision.x - pose.north_m, decision.y - pose.east_m
     distance_m = math.hypot(north_m, east_m)
-    cap_m_s = config.max_step_m / config.velocity_horizon_s
-    if (
-        decision.down_m is None
-    ):  # it moves on: the planner's speed, as far as the step reaches within the horizon
+    if decision.down_m is None:
+        # It moves on: at the planner's speed, but no further than the step within the horizon.
         planned_m_s = math.hypot(setpoint.vx, setpoint.vy)
-        speed_m_s = min(planned_m_s, distance_m / config.velocity_horizon_s)
+        speed_m_s = min(planned_m_s, distance_m / horizon_s)
     else:  # back to the place that is held, or a probe
-        cap_m_s = config.max_step_m / config.velocity_horizon_s
         speed_m_s = min(_HOLD_SPEED_M_S, cap_m_s, _HOLD_GAIN_HZ * distance_m)
     scale = speed_m_s / distance_m if distance_m > 0.0 else 0.0
     vx, vy = _to_frame(scale * north_m, scale * east_m, reading, heading)

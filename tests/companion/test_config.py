@@ -66,6 +66,10 @@ def test_an_integer_does_for_a_float():
         ("[source]\npath = []", "source.path: found a list; allowed: text"),
         ('[source]\nkind = "v4l2"', 'source.kind: found "v4l2"; allowed: one of "file", "socket"'),
         (
+            "[guidance]\nvelocity_horizon_s = 0.2",
+            "guidance.velocity_horizon_s: found 0.2; allowed: 0 (the autopilot's own), or from 0.5 to 10",
+        ),
+        (
             "[link]\nsigning_link_id = 256",
             "link.signing_link_id: found 256; allowed: whole number from 0 and up to 255",
         ),

@@ -30,6 +30,8 @@ from tests.fakes.wire_flight import ORIGIN, WireFlight, frame_of, glob, local
 PX4, ARDUPILOT = Autopilot.PX4, Autopilot.ARDUPILOT
 POSITION, VELOCITY, POSVEL = 3576, 3527, 3520
 HALL = room(40.0, 40.0)
+HORIZON_S = {PX4: 1.5, ARDUPILOT: 4.1}
+"""From the last velocity to standing still, as measured."""
 WALL = [(5.0, -20.0, 5.0, 20.0)]
 
 
@@ -98,9 +100,32 @@ def test_the_speed_is_kept_where_the_caps_allow_it_and_cut_where_not():
         flight = WireFlight(HALL)
         flight.stream(local(VELOCITY, v=(wanted, 0.0, 0.0)), 10)
         assert math.hypot(flight.vn, flight.ve) == pytest.approx(expected, rel=0.02)
-    slow = WireFlight(HALL, GuidanceConfig(velocity_horizon_s=4.5), autopilot=ARDUPILOT)
-    slow.stream(local(VELOCITY, v=(3.0, 0.0, 0.0)), 10)
-    assert math.hypot(slow.vn, slow.ve) == pytest.approx(1.5 / 4.5, rel=0.02)
+    for autopilot, horizon_s, expected in (
+        (ARDUPILOT, 0.0, 1.5 / 4.1),
+        (ARDUPILOT, 2.0, 0.75),
+        (PX4, 3.0, 0.5),
+    ):
+        flight = WireFlight(HALL, GuidanceConfig(velocity_horizon_s=horizon_s), autopilot=autopilot)
+        flight.stream(local(VELOCITY, v=(3.0, 0.0, 0.0)), 12)
+        assert math.hypot(flight.vn, flight.ve) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
+def test_a_velocity_whose_setpoints_end_stops_within_its_step(autopilot):
+    flight = WireFlight(HALL, autopilot=autopilot)
+    flight.stream(local(VELOCITY, v=(3.0, 0.0, 0.0)), 12)
+    last = flight.n
+    for _ in range(200):
+        flight.send(None)
+    assert flight.vn < 0.01
+    assert 0.0 < flight.n - last <= flight.config.max_step_m
+
+
+def test_small_offsets_that_are_streamed_are_a_way_and_not_an_arrival():
+    flight = WireFlight(HALL, autopilot=ARDUPILOT)
+    flight.stream(local(POSITION, 7, p=(0.4, 0.0, 0.0)), 15)
+    assert flight.n > 1.0
+    assert "at the goal" not in [c.reason for c in flight.changes]
 
 
 def test_vz_is_the_planners_in_every_state():
@@ -241,6 +266,15 @@ def test_a_hold_in_an_offset_frame_does_not_repeat_its_z_offset(frame):
     flight.stream(climbing, 30)
     assert flight.d == pytest.approx(held, abs=0.1)
     assert math.dist((flight.n, flight.e), flight.switch._plan.anchor) < 0.3
+
+
+@pytest.mark.parametrize("frame", [8, 9])
+def test_a_yaw_from_the_heading_that_asks_for_none_passes(frame):
+    flight = WireFlight(HALL, autopilot=ARDUPILOT, yaw=1.0)
+    flight.stream(local(2552, frame, yaw=0.0), 1)
+    assert isinstance(flight.verdicts[-1][1], Forward)
+    flight.stream(local(2552, frame, yaw=0.5), 1)  # repeated, it turns without end: at the capped rate
+    assert flight.yaw == pytest.approx(1.0 + math.radians(30), abs=0.1)
 
 
 def test_a_climb_alone_in_an_offset_frame_passes():
@@ -405,7 +439,7 @@ def check(
     held = flight.state in (State.HOLD, State.ALIGN, State.TURN)
     if reading.motion is Motion.VELOCITY:
         speed = math.hypot(*target.velocity_ned_m_s[:2])
-        assert speed * config.velocity_horizon_s <= config.max_step_m + 1e-5
+        assert speed * HORIZON_S[flight.autopilot] <= config.max_step_m + 1e-5
         assert speed <= math.hypot(setpoint.vx, setpoint.vy) + (
             0.5 if held or flight.state is State.PROBE else 1e-5
         )

@@ -2,8 +2,8 @@
 
 The pipe is ``p3headlessgl``: EGL on Mesa's software rasteriser. The same pose gives the same pixels. A picture is
 rendered at twice its size and averaged, its textures sharpened by one level: nearer to a picture averaged from 16 or
-36 samples a pixel than four-fold multisampling with anisotropic textures is, in half the time (``benchmarks`` in
-docs/simulation.md). Depth is rendered on its own, at the pixels' centres, and only when it is asked for.
+36 samples a pixel than four-fold multisampling with anisotropic textures is, in half the time
+(``benchmarks/render_cost.py``). Depth is rendered on its own, at the pixels' centres, and only when it is asked for.
 
 Panda3D is imported inside the functions: it is part of the extra ``sim``.
 """
@@ -83,7 +83,7 @@ class PandaCamera:
         from panda3d import core
 
         self._engine = core.GraphicsEngine(self._pipe)
-        self._root = scene_graph(
+        self._root: Any = scene_graph(
             world_surfaces(world),
             world.light,
             anisotropy=self._quality.anisotropy,
@@ -102,11 +102,17 @@ class PandaCamera:
         self.close()
 
     def close(self) -> None:
-        """Give the buffers back. The camera cannot be used afterwards."""
+        """Give buffers and pictures back. The camera cannot be used afterwards."""
+        if self._root is None:
+            return
         self._images.clear()
         self._depths.clear()
         self._host = None
         self._engine.remove_all_windows()
+        for texture in self._root.find_all_textures():
+            texture.clear()  # states that Panda3D keeps for reuse would keep the pictures too
+        self._root = None
+        _forget_unused_states()
 
     def render(
         self,
@@ -173,6 +179,8 @@ class PandaCamera:
 
     def _host_buffer(self) -> Any:
         """Return the small buffer whose graphics context all others share; made when first needed."""
+        if self._root is None:
+            raise RuntimeError("the camera is closed")
         if self._host is None:
             self._host = _made(self._engine, self._pipe, "host", (1, 1), None)
             self._host.set_active(False)
@@ -288,6 +296,7 @@ class _Buffer:
             engine.render_frame()
         finally:
             self._buffer.set_active(False)
+        _forget_unused_states()
         data = self._texture.get_ram_image()
         if not data:
             raise SimulationExtraError(
@@ -313,6 +322,14 @@ def _made(engine: Any, pipe: Any, name: str, size: tuple[int, int], host: Any) -
             f"EGL gives no offscreen buffer of {size[0]} x {size[1]} pixels: {_install_hint()}"
         )
     return buffer
+
+
+def _forget_unused_states() -> None:
+    """Free states and transforms that nobody uses: Panda3D leaves that to a task of the framework that is not used here."""
+    from panda3d import core
+
+    core.RenderState.garbage_collect()
+    core.TransformState.garbage_collect()
 
 
 @functools.cache

@@ -206,6 +206,28 @@ def test_one_camera_does_not_disturb_another() -> None:
         np.testing.assert_array_equal(third.render(CAMERA, EYE, FORWARD), image)
 
 
+def test_cameras_that_are_closed_leave_nothing_behind() -> None:
+    from panda3d import core
+
+    def use_one() -> int:
+        with PandaCamera(a_world(wall="brick_wall_1")) as eye:
+            for north_m in np.linspace(0.0, 1.0, 20):
+                eye.render(CAMERA, (north_m, 0.0, -1.0), FORWARD)
+                eye.depth(CAMERA, (north_m, 0.0, -1.0), FORWARD)
+        return int(core.RenderState.get_num_states()) + int(core.TransformState.get_num_states())
+
+    first = use_one()
+    assert max(use_one() for _ in range(3)) <= first + 5
+
+
+def test_a_closed_camera_says_so() -> None:
+    eye = PandaCamera(a_world())
+    eye.close()
+    eye.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        eye.render(CAMERA, EYE, FORWARD)
+
+
 def test_another_process_gets_the_same_pixels() -> None:
     code = "from tests.companion.sim.test_panda_camera import digest; print(digest())"
     other = subprocess.run(

@@ -51,7 +51,6 @@ _MASK: Final = struct.Struct("<H")
 _X: Final = 4
 _Z: Final = 12
 _VX: Final = 16
-_ACCELERATION: Final = slice(28, 40)
 _YAW: Final = 40
 _TYPE_MASK: Final = 48
 
@@ -153,7 +152,6 @@ def rewrite(frame: RawFrame, new: Replacement) -> bytes:
             mask = type_mask & keeps | TypeMask.ACCELERATION_IGNORE
         else:
             mask = _patch_position(payload, type_mask, new)
-        payload[_ACCELERATION] = bytes(12)
         _TWO_FLOATS.pack_into(payload, _YAW, 0.0 if new.yaw is None else new.yaw, 0.0)
     except (OverflowError, struct.error) as error:
         raise ValueError(f"does not fit its field (a float32 or an int32): {new}") from error

@@ -428,6 +428,19 @@ def test_each_autopilot_gets_what_it_understands():
         assert bench.send(local(3135)) == Unprotected("acceleration only")
 
 
+def test_a_hold_by_velocity_flies_back_only_as_long_as_the_pose_is_fresh():
+    bench = flying()
+    bench.flight.set_fault("camera", "camera gone", bench.now)
+    moving = local(3527, 1, v=(0.5, 0, 0))
+    assert bench.send(moving).vx == 0.0
+    bench.velocity = (0.5, 0.0, 0.0)  # a gust
+    bench.telemetry(1.0)
+    assert bench.send(moving).vx < -0.1
+    bench.now += SEC
+    verdict = bench.send(moving)
+    assert (verdict.vx, verdict.vy, verdict.yaw, verdict.action) == (0.0, 0.0, None, "held")
+
+
 def test_a_copters_yaw_in_a_body_frame_is_from_the_heading_and_px4s_is_not():
     for bench, expected in ((flying_copter(), 0.0), (flying(), 1.0)):
         bench.yaw = 1.0

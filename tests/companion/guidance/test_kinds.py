@@ -193,6 +193,14 @@ def test_velocity_hold_never_moves_sideways_and_says_why():
     assert flight.n > 3.0, "positions fly"
 
 
+def test_velocity_hold_gives_up_once_and_stays_so():
+    flight = WireFlight(HALL, GuidanceConfig(velocity="hold", give_up_s=5.0))
+    flight.stream(local(VELOCITY, v=(0.8, 0.0, 0.0)), 12)
+    assert [e.reason for e in flight.gave_up] == ["velocity setpoints are held"]
+    assert flight.switch.reason == "gave up: velocity setpoints are held"
+    assert len(flight.changes) <= 4
+
+
 def test_a_hold_brings_a_drifting_vehicle_back_slowly():
     flight = WireFlight(HALL)
     flight.stream(local(VELOCITY, v=(0.8, 0.0, 0.0)), 6)
@@ -477,6 +485,20 @@ def check(
         # a hold stops a turn at the heading of the moment, which is never far behind
         assert turned <= cap + 1e-5 or (flight.state is State.HOLD and turned <= math.radians(33))
     yaws.append((flight.now, target.yaw_rad))
+
+
+@pytest.mark.parametrize("mask", [2496, 504, 2552 & ~64])
+def test_further_terms_do_not_pass_although_the_step_and_the_yaw_are_granted(mask):
+    """The velocity of a trajectory, a yaw rate beside a yaw, an acceleration."""
+    flight = WireFlight(HALL)
+    flight.stream(local(2552, p=(9.0, 0.0, -1.2)), 6)
+    assert flight.state is State.FOLLOW
+    near = (flight.n + 0.7, flight.e, -1.2)
+    assert isinstance(flight.send(local(2552, p=near)), Forward)
+    verdict = flight.send(local(mask, p=near, v=(2.0, 1.0, 0.0), a=(1.0, 1.0, 0.0), rate=0.1))
+    assert not isinstance(verdict, Forward)
+    sent = flight.wire[-1][2]
+    assert (sent.type_mask, sent.vx, sent.vy, sent.afx, sent.yaw_rate) == (2552, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_acceleration_terms_never_pass_while_protected():

@@ -243,6 +243,20 @@ def test_steering_stops_while_no_way_is_open():
     assert bench.reach(verdict) == 0.0
 
 
+def test_a_height_is_held_wherever_no_step_is_made_and_nowhere_else():
+    bench = started()
+    assert bench.ask(AHEAD).down_m == -1.0  # HOLD
+    bench.void(0.0)
+    assert bench.ask(AHEAD).down_m is None  # FOLLOW, moving on
+    bench.void(math.radians(22), {math.radians(22): 0.5})
+    assert (bench.reach(bench.ask(AHEAD)), bench.ask(AHEAD).down_m) == (0.0, -1.0)  # looking again
+    bench = started()
+    bench.void(math.radians(CONFIG.align_deg + 3))
+    assert (bench.reach(bench.ask(AHEAD)), bench.ask(AHEAD).down_m) == (0.0, -1.0)  # STEER, not in sight yet
+    bench.yaw = math.radians(10)
+    assert bench.ask(AHEAD).down_m is None
+
+
 def test_losing_the_answer_while_steering_never_leads_back_to_an_old_anchor():
     bench = started()
     bench.ask(AHEAD)

@@ -42,18 +42,30 @@ def test_two_flights_with_the_same_seed_are_the_same_to_the_bit_answers_included
 @pytest.mark.slow
 @pytest.mark.parametrize("world", ["corridor", "room", "door", "deadend"])
 def test_the_service_flies_in_the_rendered_worlds(world: str):
-    spec = FlightSpec(world=world, time_limit_s=8.0)
+    spec = FlightSpec(world=world, time_limit_s=4.5)
     place = place_of(spec)
     flown = fly(spec, place)
     result = judged(spec, place, flown)
     assert (result.outcome, result.collisions) == ("timeout", 0)
-    assert result.min_clearance_m > 0.2
     assert result.decisions == pytest.approx(5 * result.time_s, abs=1)
     assert result.max_setpoint_gap_s < 0.11
     assert sum(result.states.values()) == pytest.approx(result.time_s, abs=0.1)
-    assert result.path_m > 0.3, "it has moved"
+    planned, sent = flown.record.planned_ned_m, flown.record.sent_ned_m
+    assert (np.linalg.norm(sent - planned, axis=1) > 1.0).any(), "the service is in the way"
     # z is the planner's, bit for bit, whatever the service did with the rest
-    assert set(flown.record.sent_ned_m[:, 2].tolist()) == {float(np.float32(place.goal_ned_m[2]))}
+    assert set(sent[:, 2].tolist()) == {float(np.float32(place.goal_ned_m[2]))}
+
+
+@pytest.mark.slow
+def test_the_same_flight_in_real_time_has_the_service_the_camera_and_the_vehicle_in_processes():
+    spec = FlightSpec(world="corridor", time_limit_s=4.0, realtime=True)
+    place = place_of(spec)
+    flown = fly(spec, place)
+    result = judged(spec, place, flown)
+    assert (result.outcome, result.collisions) == ("timeout", 0)
+    assert result.decisions > 0
+    assert result.states
+    assert len(flown.record.setpoint_time_s) > 40
 
 
 @pytest.mark.slow

@@ -24,6 +24,16 @@ from enum import Enum
 
 from companion.guidance.setpoint import GlobalSetpoint, LocalSetpoint, MavFrame, Setpoint, TypeMask
 
+# Plain integers: an IntFlag takes a microsecond for each operation.
+_POSITION = int(TypeMask.POSITION_IGNORE)
+_X_Y = int(TypeMask.X_IGNORE | TypeMask.Y_IGNORE)
+_Z = int(TypeMask.Z_IGNORE)
+_VELOCITY = int(TypeMask.VELOCITY_IGNORE)
+_VX_VY = int(TypeMask.VX_IGNORE | TypeMask.VY_IGNORE)
+_VZ = int(TypeMask.VZ_IGNORE)
+_ACCELERATION = int(TypeMask.ACCELERATION_IGNORE)
+_FORCE = int(TypeMask.FORCE_SET)
+
 _GLOBAL_FRAMES_PX4 = (MavFrame.GLOBAL_INT, MavFrame.GLOBAL_RELATIVE_ALT_INT, MavFrame.GLOBAL_TERRAIN_ALT_INT)
 _GLOBAL_FRAMES_ARDUPILOT = (
     *_GLOBAL_FRAMES_PX4,
@@ -113,43 +123,42 @@ def understand(setpoint: Setpoint, autopilot: Autopilot) -> Reading | NotUnderst
 
 def _by_px4(setpoint: Setpoint) -> Reading | NotUnderstood:
     mask, frame = setpoint.type_mask, setpoint.coordinate_frame
-    uses_acceleration = mask & TypeMask.ACCELERATION_IGNORE != TypeMask.ACCELERATION_IGNORE
-    if mask & TypeMask.FORCE_SET and uses_acceleration:
+    uses_acceleration = mask & _ACCELERATION != _ACCELERATION
+    if mask & _FORCE and uses_acceleration:
         return NotUnderstood("force")
     if isinstance(setpoint, GlobalSetpoint):
-        if not mask & TypeMask.POSITION_IGNORE:
+        if not mask & _POSITION:
             return Reading(Motion.POSITION) if frame in _GLOBAL_FRAMES_PX4 else _frame(frame)
         return _velocity_or_why_not(mask, Reading(Motion.VELOCITY))
     if frame == MavFrame.BODY_NED:
-        if mask & TypeMask.VELOCITY_IGNORE:
+        if mask & _VELOCITY:
             return _frame(frame)
         return Reading(Motion.VELOCITY, in_body_frame=True)
     if frame != MavFrame.LOCAL_NED:
         return _frame(frame)
-    if not mask & TypeMask.POSITION_IGNORE:
+    if not mask & _POSITION:
         return Reading(Motion.POSITION)
     # PX4 takes each axis by itself; one that is neither held nor moved stops all three.
-    vertical = not (mask & TypeMask.Z_IGNORE and mask & TypeMask.VZ_IGNORE)
-    if vertical and not mask & (TypeMask.X_IGNORE | TypeMask.Y_IGNORE):
+    vertical = not (mask & _Z and mask & _VZ)
+    if vertical and not mask & _X_Y:
         return Reading(Motion.POSITION)
-    sideways = TypeMask.X_IGNORE | TypeMask.Y_IGNORE
-    if vertical and mask & sideways == sideways and not mask & (TypeMask.VX_IGNORE | TypeMask.VY_IGNORE):
+    if vertical and mask & _X_Y == _X_Y and not mask & _VX_VY:
         return Reading(Motion.VELOCITY)
     return _why_not(mask)
 
 
 def _by_ardupilot(setpoint: Setpoint) -> Reading | NotUnderstood:
     mask, frame = setpoint.type_mask, setpoint.coordinate_frame
-    uses_acceleration = not mask & TypeMask.ACCELERATION_IGNORE  # one bit is enough to ignore all three
-    if mask & TypeMask.FORCE_SET and uses_acceleration:
+    uses_acceleration = not mask & _ACCELERATION  # one bit is enough to ignore all three
+    if mask & _FORCE and uses_acceleration:
         return NotUnderstood("force")
     in_body_frame = frame in _BODY_FRAMES and isinstance(setpoint, LocalSetpoint)
     if isinstance(setpoint, LocalSetpoint) and frame not in (MavFrame.LOCAL_NED, *_OFFSET_FRAMES):
         return _frame(frame)
-    if mask & TypeMask.POSITION_IGNORE:
+    if mask & _POSITION:
         reading = Reading(Motion.VELOCITY, in_body_frame=in_body_frame, yaw_is_relative=in_body_frame)
         return _velocity_or_why_not(mask, reading)
-    uses_velocity = not mask & TypeMask.VELOCITY_IGNORE
+    uses_velocity = not mask & _VELOCITY
     if not uses_velocity and uses_acceleration:
         return NotUnderstood("position with acceleration")  # ArduPilot stops
     if isinstance(setpoint, GlobalSetpoint):
@@ -164,7 +173,7 @@ def _by_ardupilot(setpoint: Setpoint) -> Reading | NotUnderstood:
 
 
 def _velocity_or_why_not(mask: int, reading: Reading) -> Reading | NotUnderstood:
-    return _why_not(mask) if mask & TypeMask.VELOCITY_IGNORE else reading
+    return _why_not(mask) if mask & _VELOCITY else reading
 
 
 def _frame(frame: int) -> NotUnderstood:
@@ -172,10 +181,10 @@ def _frame(frame: int) -> NotUnderstood:
 
 
 def _why_not(mask: int) -> NotUnderstood:
-    if mask & TypeMask.POSITION_IGNORE != TypeMask.POSITION_IGNORE:
+    if mask & _POSITION != _POSITION:
         return NotUnderstood("partial position")
-    if mask & TypeMask.VELOCITY_IGNORE != TypeMask.VELOCITY_IGNORE:
+    if mask & _VELOCITY != _VELOCITY:
         return NotUnderstood("partial velocity")
-    if mask & TypeMask.ACCELERATION_IGNORE != TypeMask.ACCELERATION_IGNORE:
+    if mask & _ACCELERATION != _ACCELERATION:
         return NotUnderstood("acceleration only")
     return NotUnderstood("no position")

@@ -54,22 +54,36 @@ _VX: Final = 16
 _YAW: Final = 40
 _TYPE_MASK: Final = 48
 
-_FLOATS: Final = (
-    (4, TypeMask.X_IGNORE),
-    (8, TypeMask.Y_IGNORE),
-    (12, TypeMask.Z_IGNORE),
-    (16, TypeMask.VX_IGNORE),
-    (20, TypeMask.VY_IGNORE),
-    (24, TypeMask.VZ_IGNORE),
-    (28, TypeMask.AX_IGNORE),
-    (32, TypeMask.AY_IGNORE),
-    (36, TypeMask.AZ_IGNORE),
-    (40, TypeMask.YAW_IGNORE),
-    (44, TypeMask.YAW_RATE_IGNORE),
-)
-"""Offset of each float of the payload and the bit of type_mask that ignores it (GLOBAL_INT: from z on)."""
-
+# Plain integers: an IntFlag takes a microsecond for each operation.
+_POSITION_IGNORE: Final = int(TypeMask.POSITION_IGNORE)
+_X_Y_IGNORE: Final = int(TypeMask.X_IGNORE | TypeMask.Y_IGNORE)
+_Z_IGNORE: Final = int(TypeMask.Z_IGNORE)
+_VX_VY_IGNORE: Final = int(TypeMask.VX_IGNORE | TypeMask.VY_IGNORE)
+_VZ_IGNORE: Final = int(TypeMask.VZ_IGNORE)
+_ACCELERATION_IGNORE: Final = int(TypeMask.ACCELERATION_IGNORE)
+_YAW_IGNORE: Final = int(TypeMask.YAW_IGNORE)
+_YAW_RATE_IGNORE: Final = int(TypeMask.YAW_RATE_IGNORE)
 _NOT_FORCE: Final = 0x0FFF & ~int(TypeMask.FORCE_SET)
+
+_FLOATS: Final = tuple(
+    (offset, int(ignore))
+    for offset, ignore in (
+        (4, TypeMask.X_IGNORE),
+        (8, TypeMask.Y_IGNORE),
+        (12, TypeMask.Z_IGNORE),
+        (16, TypeMask.VX_IGNORE),
+        (20, TypeMask.VY_IGNORE),
+        (24, TypeMask.VZ_IGNORE),
+        (28, TypeMask.AX_IGNORE),
+        (32, TypeMask.AY_IGNORE),
+        (36, TypeMask.AZ_IGNORE),
+        (40, TypeMask.YAW_IGNORE),
+        (44, TypeMask.YAW_RATE_IGNORE),
+    )
+)
+"""Offset of each float of the payload and the bit of type_mask that ignores it."""
+_GLOBAL_FLOATS: Final = _FLOATS[2:]
+"""Latitude and longitude are integers."""
 
 # ATTITUDE_TARGET_TYPEMASK
 _BODY_RATE_IGNORE: Final = (1, 2, 4)
@@ -148,14 +162,13 @@ def rewrite(frame: RawFrame, new: Replacement) -> bytes:
     try:
         if isinstance(new, RewriteVelocity):
             _patch_velocity(payload, new)
-            keeps = TypeMask.POSITION_IGNORE | TypeMask.VZ_IGNORE
-            mask = type_mask & keeps | TypeMask.ACCELERATION_IGNORE
+            mask = type_mask & (_POSITION_IGNORE | _VZ_IGNORE) | _ACCELERATION_IGNORE
         else:
             mask = _patch_position(payload, type_mask, new)
         _TWO_FLOATS.pack_into(payload, _YAW, 0.0 if new.yaw is None else new.yaw, 0.0)
     except (OverflowError, struct.error) as error:
         raise ValueError(f"does not fit its field (a float32 or an int32): {new}") from error
-    mask |= TypeMask.YAW_RATE_IGNORE | (TypeMask.YAW_IGNORE if new.yaw is None else 0)
+    mask |= _YAW_RATE_IGNORE | (_YAW_IGNORE if new.yaw is None else 0)
     _MASK.pack_into(payload, _TYPE_MASK, mask & _NOT_FORCE)
     _zero_ignored(payload, mask, frame.message_id)
     return _reassemble(frame, payload)
@@ -180,10 +193,10 @@ def _patch_velocity(payload: bytearray, new: RewriteVelocity) -> None:
 
 def _patch_position(payload: bytearray, type_mask: int, new: Rewrite | RewriteOffset | RewriteGlobal) -> int:
     """Set the position and return the bits of type_mask for it; velocities are ignored, but for a vz that stands for z."""
-    if type_mask & (TypeMask.X_IGNORE | TypeMask.Y_IGNORE):
+    if type_mask & _X_Y_IGNORE:
         raise ValueError(f"type_mask {type_mask} ignores x or y")
-    climbs = bool(type_mask & TypeMask.Z_IGNORE)
-    if climbs and (not isinstance(new, Rewrite) or type_mask & TypeMask.VZ_IGNORE):
+    climbs = bool(type_mask & _Z_IGNORE)
+    if climbs and (not isinstance(new, Rewrite) or type_mask & _VZ_IGNORE):
         raise ValueError(f"type_mask {type_mask} ignores z, and no vz stands for it")
     if isinstance(new, RewriteGlobal):
         _TWO_INTS.pack_into(payload, _X, new.lat_int, new.lon_int)
@@ -191,8 +204,7 @@ def _patch_position(payload: bytearray, type_mask: int, new: Rewrite | RewriteOf
         _TWO_FLOATS.pack_into(payload, _X, new.x, new.y)
     if isinstance(new, RewriteOffset) and new.z is not None:
         _FLOAT.pack_into(payload, _Z, new.z)
-    ignored = TypeMask.ACCELERATION_IGNORE | TypeMask.VX_IGNORE | TypeMask.VY_IGNORE
-    return int(ignored | (TypeMask.Z_IGNORE if climbs else TypeMask.VZ_IGNORE))
+    return _ACCELERATION_IGNORE | _VX_VY_IGNORE | (_Z_IGNORE if climbs else _VZ_IGNORE)
 
 
 def _zero_ignored(payload: bytearray, mask: int, message_id: int) -> None:
@@ -227,8 +239,8 @@ def sanitise(frame: RawFrame) -> bytes:
     return _reassemble(frame, payload)
 
 
-def _floats_of(message_id: int) -> tuple[tuple[int, TypeMask], ...]:
-    return _FLOATS[2:] if message_id == SET_POSITION_TARGET_GLOBAL_INT else _FLOATS
+def _floats_of(message_id: int) -> tuple[tuple[int, int], ...]:
+    return _GLOBAL_FLOATS if message_id == SET_POSITION_TARGET_GLOBAL_INT else _FLOATS
 
 
 def attitude_nonfinite_used_fields(frame: RawFrame) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -128,7 +129,7 @@ def test_motion_between_two_poses() -> None:
 
 
 def test_noise_has_the_variance_asked_for() -> None:
-    effects = ImageEffects(vignetting=0.0, read_noise_grey=2.0, shot_noise_grey=0.05)
+    effects = replace(ImageEffects.none(), read_noise_grey=2.0, shot_noise_grey=0.05)
     for grey in (40, 160):
         image = sensed(np.full((240, 320), grey, np.uint8), effects, np.random.default_rng(3)).astype(float)
         expected = np.sqrt(4.0 + 0.05 * grey + 1.0 / 12.0)  # and that of rounding
@@ -141,7 +142,7 @@ def test_brightness_and_vignetting() -> None:
     grey = np.full((120, 160), 100, np.uint8)
     rng = np.random.default_rng(0)
     np.testing.assert_array_equal(sensed(grey, ideal, rng), grey)
-    bright = ImageEffects(brightness=3.0, vignetting=0.5, read_noise_grey=0, shot_noise_grey=0)
+    bright = replace(ideal, brightness=3.0, vignetting=0.5)
     image = sensed(grey, bright, rng)
     assert image[60, 80] == 255
     assert image[0, 0] == image[-1, -1] == 150
@@ -210,7 +211,7 @@ def test_a_camera_that_is_put_elsewhere_does_not_blur() -> None:
 
 
 def test_a_sensor_in_a_world_sees_it(ideal: PandaCamera) -> None:
-    effects = ImageEffects(brightness=0.5, vignetting=0.0, read_noise_grey=1.0, shot_noise_grey=0.0)
+    effects = replace(ImageEffects.none(), brightness=0.5, read_noise_grey=1.0)
     with SensorCamera.in_world(WORLD, effects=effects, seed=1, frame_period_s=0.1) as camera:
         image = camera.render(CAMERA, EYE, FORWARD).astype(float)
     assert np.abs(image - 0.5 * ideal.render(CAMERA, EYE, FORWARD)).mean() < 1.2

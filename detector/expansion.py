@@ -41,6 +41,10 @@ _KNOWN_SAMPLES: Final = 3
 _HIT_SAMPLES: Final = 3
 _ONE_SURFACE_SCATTER: Final = 1.6  # times the noise: beyond it the samples see several depths
 _HIT_SHARE: Final = 0.10
+_COVER_HALF_HEIGHT: Final = math.sin(math.radians(14.0))
+_COVER_STEP: Final = 0.85
+_COVER_SLACK: Final = 1.3  # what stands a little nearer than the distance covers it too: it is met itself
+_LEAST_COVER_M: Final = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +92,14 @@ class RangeSamples:
 
     def __len__(self) -> int:
         return len(self.rays)
+
+    def joined(self, others: RangeSamples) -> RangeSamples:
+        """Return these samples and others of the same camera."""
+        return RangeSamples(
+            np.concatenate([self.rays, others.rays]),
+            np.concatenate([self.inverse_per_m, others.inverse_per_m]),
+            np.concatenate([self.sigma_per_m, others.sigma_per_m]),
+        )
 
     @cached_property
     def is_resolved(self) -> NDArray[np.bool_]:
@@ -434,6 +446,7 @@ def free_range_along(
     half_width_m: float,
     half_height_m: float,
     up_camera: ArrayLike | None = None,
+    hidden_width_m: float = math.inf,
 ) -> MetricRange | None:
     """Return how far the vehicle could move along a ray before it meets something that was seen.
 
@@ -452,6 +465,9 @@ def free_range_along(
         Of the vehicle, with its margin.
     up_camera
         (3,) up, in the camera's axes; (0, -1, 0) when not given, which is right for a level camera.
+    hidden_width_m
+        The answer ends where something so wide could stand in the way between the samples, unseen: a pillar without texture has none,
+        and what is seen to its left and right says nothing of it.
     """
     ray = _vector(ray_camera)
     ray = ray / np.linalg.norm(ray)
@@ -466,6 +482,9 @@ def free_range_along(
     if np.count_nonzero(near_ray) < _KNOWN_SAMPLES:
         return None
     vouched = _vouched(samples.inverse_per_m[near_ray], samples.sigma_per_m[near_ray])
+    covered_m = _covered_m(samples, ray, side, vertical, half_width_m, hidden_width_m, vouched.distance_m)
+    if covered_m < vouched.distance_m:
+        vouched = MetricRange(covered_m, vouched.spread_m, vouched.samples)
 
     along_m, beside_m, above_m = np.stack((ray, side, vertical)) @ samples.points_m.T
     inside = samples.is_resolved & (along_m > 0.0)
@@ -480,6 +499,40 @@ def free_range_along(
     scatter_m = 1.4826 * float(np.median(np.abs(surface_m - np.median(surface_m))))
     single_m = float(np.median(samples.sigma_per_m[of_surface])) * hit_m**2
     return MetricRange(hit_m, max(scatter_m, single_m / math.sqrt(surface_m.size)), int(surface_m.size))
+
+
+def _covered_m(
+    samples: RangeSamples,
+    ray: NDArray[np.float64],
+    side: NDArray[np.float64],
+    vertical: NDArray[np.float64],
+    half_width_m: float,
+    hidden_width_m: float,
+    most_m: float,
+) -> float:
+    """Return how far the vehicle's width is looked through without a gap in which something could hide."""
+    if not math.isfinite(hidden_width_m):
+        return most_m
+    forward, beside, above = np.stack((ray, side, vertical)) @ samples.rays.T
+    level = (np.abs(above) <= _COVER_HALF_HEIGHT) & (forward > 0.0)
+    azimuth_rad = np.arctan2(beside[level], forward[level])
+    # Surely no nearer than this: a sample that cannot tell far from near covers nothing.
+    nearest_per_m = samples.inverse_per_m[level] + 2.0 * samples.sigma_per_m[level]
+    order = np.argsort(azimuth_rad)
+    azimuth_rad, nearest_per_m = azimuth_rad[order], nearest_per_m[order]
+    distance_m = most_m
+    while distance_m > _LEAST_COVER_M:
+        half_rad = math.atan2(half_width_m, distance_m)
+        seen_rad = azimuth_rad[nearest_per_m * distance_m < _COVER_SLACK]
+        first, last = np.searchsorted(seen_rad, (-half_rad, half_rad))
+        # A gap counts whole where it only begins in the way: what hides in it may stand at its edge. Beyond the picture nothing is known.
+        left = seen_rad[first - 1 : first] if first else (-half_rad,)
+        right = seen_rad[last : last + 1] if last < len(seen_rad) else (half_rad,)
+        gaps_rad = np.diff(np.concatenate([left, seen_rad[first:last], right]))
+        if float(gaps_rad.max()) * distance_m <= hidden_width_m:
+            return distance_m
+        distance_m *= _COVER_STEP
+    return _LEAST_COVER_M
 
 
 def _vouched(inverse: NDArray[np.float64], sigma: NDArray[np.float64]) -> MetricRange:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 import cv2
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from detector.camera_model import CameraModel
+from detector.dense_flow import DenseFlowParams, grid_tracks
 from detector.expansion import (
     MetricRange,
     RangeSamples,
@@ -90,6 +91,11 @@ class ObserverParams:
         How far the attitude between two frames, and a track's end, may be wrong (one standard deviation).
     scene_turn_deg, scene_distance_m, scene_gap_s
         A turn, a way or a pause after which the scene counts as another one: the detector estimates p, n and k anew.
+    hidden_width_m
+        A way counts as free no farther than to where something so wide could stand in it unseen, between the samples. Larger:
+        bolder where there is little texture.
+    dense
+        Flow on a grid, beside the detector's tracks, for ranges; None: the tracks alone.
     """
 
     vehicle_width_m: float = 0.7
@@ -107,6 +113,8 @@ class ObserverParams:
     scene_turn_deg: float = 40.0
     scene_distance_m: float = 3.0
     scene_gap_s: float = 2.0
+    hidden_width_m: float = 0.3
+    dense: DenseFlowParams | None = field(default_factory=DenseFlowParams)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.baseline_min_m <= self.baseline_target_m <= self.baseline_max_m:
@@ -227,6 +235,7 @@ class Observation:
             half_width_m=0.5 * geometry.params.vehicle_width_m,
             half_height_m=0.5 * geometry.params.vehicle_height_m,
             up_camera=up,
+            hidden_width_m=geometry.params.hidden_width_m,
         )
 
     def points_within(self, range_m: float) -> NDArray[np.float64]:
@@ -380,8 +389,10 @@ class VoidObserver:
         if isinstance(result.detection, NoDetection) and result.detection.reason in _LOST:
             self._forget_scene()
         geometry = None
-        if camera is not None and len(result.tracks):
-            geometry = self._geometry(result.tracks, camera, pose, translation_later)
+        if camera is not None and (len(result.tracks) or translation_later is not None):
+            geometry = self._geometry(
+                result.tracks, earlier.frame, later, camera, pose, later_from_earlier, translation_later
+            )
         return Observation(
             result.detection,
             time_ns,
@@ -394,14 +405,17 @@ class VoidObserver:
     def _geometry(
         self,
         tracks: Tracks,
+        earlier: Frame,
+        later: Frame,
         camera: CameraModel,
         pose: CameraPose | None,
+        later_from_earlier: NDArray[np.float64] | None,
         translation_later: NDArray[np.float64] | None,
     ) -> _PairGeometry:
         params = self._observer_params
         start_px, end_px = ideal_px(camera, tracks.start_px), ideal_px(camera, tracks.end_px)
         samples = None
-        if translation_later is None:
+        if translation_later is None or later_from_earlier is None:
             focus_px = fit_focus_of_expansion(start_px, end_px, flow_sigma_px=params.flow_sigma_px)
         else:
             later_from_start = refine_rotation(
@@ -423,6 +437,19 @@ class VoidObserver:
                 later_from_start=later_from_start,
                 flow_sigma_px=params.flow_sigma_px,
             )
+            if params.dense is not None and earlier.fault is None and later.fault is None:
+                on_grid, sigma_px = grid_tracks(
+                    earlier.image, later.image, camera, later_from_earlier, translation_later, params.dense
+                )
+                dense = ranges_m(
+                    camera,
+                    on_grid.start_px,
+                    on_grid.end_px,
+                    translation_later,
+                    later_from_start=later_from_start,
+                    flow_sigma_px=sigma_px,
+                )
+                samples = samples.joined(dense)
         return _PairGeometry(
             camera=camera,
             start_px=start_px,

@@ -403,6 +403,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     # Why each of these: docs/presets.md.
     "default": {
+        "sift_contrast": 0.013,
+        "min_features": 60,
+        "min_flow_vectors": 60,
         "unique_locations": True,
         "lk_predict_rotation": True,
         "rotation_check": True,

@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 _LEAST_BLUR_PX: Final = 0.5
 _LEAST_SUB_FRAMES: Final = 4  # as many samples a pixel as a sharp picture has
 _MOST_SUB_FRAMES: Final = 12
+_BRIGHT_GREY: Final = 240.0
+_MOST_GAIN: Final = 4.0
 _NEAR_M: Final = 1.0
 """How near things are thought to be when the number of renderings is chosen."""
 
@@ -34,8 +36,10 @@ class ImageEffects:
 
     Attributes
     ----------
+    metered_grey
+        Automatic exposure: each picture is brought to this mean grey, as far as its bright parts stay below white; 0 turns it off.
     brightness
-        Factor on all grey values: exposure and gain.
+        Factor on all grey values after that.
     vignetting
         Part of the light that is lost in the corners, 0 to 1.
     read_noise_grey
@@ -46,6 +50,7 @@ class ImageEffects:
         How long the shutter is open; 0: no motion blur.
     """
 
+    metered_grey: float = 130.0
     brightness: float = 1.0
     vignetting: float = 0.1
     read_noise_grey: float = 1.5
@@ -54,6 +59,7 @@ class ImageEffects:
 
     def __post_init__(self) -> None:
         limits = {
+            "metered_grey": (0.0, 200.0),
             "brightness": (0.01, 10.0),
             "vignetting": (0.0, 1.0),
             "read_noise_grey": (0.0, 100.0),
@@ -68,7 +74,7 @@ class ImageEffects:
     @classmethod
     def none(cls) -> ImageEffects:
         """Return an ideal camera."""
-        return cls(vignetting=0.0, read_noise_grey=0.0, shot_noise_grey=0.0, exposure_s=0.0)
+        return cls(metered_grey=0.0, vignetting=0.0, read_noise_grey=0.0, shot_noise_grey=0.0, exposure_s=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +182,7 @@ def sensed(
     """Return what the sensor makes of a picture: brightness, vignetting, noise, and rounding to grey values."""
     if light.ndim != 2:
         raise ValueError(f"expected a grey image (height, width), got {light.shape}")
-    grey = light.astype(np.float32) * np.float32(effects.brightness)
+    grey = light.astype(np.float32) * np.float32(effects.brightness * _gain(light, effects.metered_grey))
     if effects.vignetting > 0.0:
         grey *= _vignette(grey.shape[0], grey.shape[1], effects.vignetting)
     if effects.read_noise_grey > 0.0 or effects.shot_noise_grey > 0.0:
@@ -184,6 +190,14 @@ def sensed(
         variance = np.float32(effects.read_noise_grey**2) + np.float32(effects.shot_noise_grey) * grey
         grey += np.sqrt(variance) * rng.standard_normal(grey.shape, dtype=np.float32)
     return np.asarray(np.clip(np.rint(grey), 0.0, 255.0).astype(np.uint8))
+
+
+def _gain(light: NDArray[np.float32] | NDArray[np.uint8], metered_grey: float) -> float:
+    """Return the factor of an automatic exposure that meters the mean, and spares the brightest parts but a fiftieth."""
+    mean, bright = float(np.mean(light)), float(np.percentile(light[::2, ::2], 98.0))
+    if metered_grey <= 0.0 or bright <= 0.0:
+        return 1.0
+    return min(max(min(metered_grey / mean, _BRIGHT_GREY / bright), 1.0 / _MOST_GAIN), _MOST_GAIN)
 
 
 def _vignette(height_px: int, width_px: int, lost: float) -> NDArray[np.float32]:

@@ -403,6 +403,18 @@ def test_the_pilot_wins_at_once_also_just_after_a_request_that_was_carried_out()
     assert bench.ask() == Forward()
 
 
+def test_a_disarm_just_after_an_arming_that_was_carried_out_counts_at_once():
+    bench = Bench()
+    bench.heartbeat(armed=False)
+    bench.telemetry(0.5)
+    bench.flight.on_engage_request(EngageRequest(arm=True, offboard=False), bench.now)
+    assert isinstance(bench.ask(), Rewrite)
+    bench.heartbeat(armed=True)
+    bench.telemetry(0.2)
+    bench.heartbeat(armed=False)
+    assert bench.ask() == Forward()
+
+
 # ---------------------------------------------------------------- kinds of setpoints, and whose
 
 

@@ -14,12 +14,6 @@ from companion.guidance.observation import DetectionReport, Pose
 from companion.guidance.pose_buffer import PoseBuffer
 from companion.guidance.setpoint import (
     Drop,
-    Forward,
-    LocalSetpoint,
-    Rewrite,
-    RewriteGlobal,
-    RewriteOffset,
-    RewriteVelocity,
     Setpoint,
     Unprotected,
     Verdict,
@@ -27,6 +21,7 @@ from companion.guidance.setpoint import (
 from companion.guidance.substitution import GaveUp, State, StateChanged, Switch
 from companion.guidance.wish import express, wish_of
 from companion.log import Log
+from companion.log_fields import report_fields, verdict_fields
 from companion.mavlink.identity import Identity, MavSeverity, MavState
 from companion.mavlink.requests import EngageRequest
 from companion.mavlink.sources import Source
@@ -125,7 +120,7 @@ class Interception:
             waited_ms = (now_ns - self._report_waiting.frame_ns) / 1e6
             self.statistics.frame_to_setpoint_ms.append(waited_ms)
             self._report_waiting = None
-        self._last_verdict = _verdict_fields(setpoint, verdict)
+        self._last_verdict = verdict_fields(setpoint, verdict)
         if self._config.log.setpoints:
             self._log.info(
                 "setpoint",
@@ -304,7 +299,7 @@ class Interception:
         self._report_waiting = report
         self.switch.on_report(report, now_ns)
         if self._config.log.detections:
-            self._log.info("detection", **_report_fields(report, now_ns))
+            self._log.info("detection", **report_fields(report, now_ns))
 
     def set_fault(self, name: str, reason: str | None, now_ns: int) -> None:
         """Tell the switch S of a failing input, or that it works again."""
@@ -368,7 +363,7 @@ class Interception:
             fields["pose"] = [round(v, 3) for v in (pose.north_m, pose.east_m, pose.down_m)]
             fields["heading_deg"] = round(math.degrees(heading_rad(pose.q_ned_from_body)), 1)
         if self._last_report is not None:
-            fields["report"] = _report_fields(self._last_report, now_ns)
+            fields["report"] = report_fields(self._last_report, now_ns)
         if self._last_verdict:
             fields["setpoint"] = self._last_verdict
         return fields
@@ -376,58 +371,3 @@ class Interception:
 
 def _severity(event: StateChanged) -> MavSeverity:
     return MavSeverity.WARNING if event.state is State.HOLD else MavSeverity.INFO
-
-
-def _verdict_fields(setpoint: Setpoint, verdict: Verdict) -> dict[str, Any]:
-    """Return what was asked for and what is sent, for the log and the status line."""
-    planned = _planned(setpoint)
-    fields: dict[str, Any] = {"planned": planned}
-    match verdict:
-        case Rewrite() | RewriteOffset():
-            fields["action"] = verdict.action
-            z = verdict.z if isinstance(verdict, RewriteOffset) and verdict.z is not None else planned[2]
-            fields["sent"] = [round(verdict.x, 3), round(verdict.y, 3), round(z, 3)]
-        case RewriteVelocity():
-            fields["action"] = verdict.action
-            fields["planned"] = [round(v, 3) for v in (setpoint.vx, setpoint.vy, setpoint.vz)]
-            fields["sent"] = [round(verdict.vx, 3), round(verdict.vy, 3), round(setpoint.vz, 3)]
-        case RewriteGlobal():
-            fields["action"] = verdict.action
-            fields["sent"] = [verdict.lat_int, verdict.lon_int, planned[2]]
-        case Forward():
-            fields["action"] = "forwarded"
-            fields["sent"] = planned
-        case Drop():
-            fields["action"] = "dropped"
-            fields["dropped"] = verdict.reason
-    if isinstance(verdict, Rewrite | RewriteOffset | RewriteVelocity | RewriteGlobal):
-        fields["yaw_deg"] = None if verdict.yaw is None else round(math.degrees(verdict.yaw), 1)
-    return fields
-
-
-def _planned(setpoint: Setpoint) -> list[float]:
-    if isinstance(setpoint, LocalSetpoint):
-        return [round(v, 3) for v in (setpoint.x, setpoint.y, setpoint.z)]
-    return [setpoint.lat_int, setpoint.lon_int, round(setpoint.alt, 3)]
-
-
-def _report_fields(report: DetectionReport, now_ns: int) -> dict[str, Any]:
-    fields: dict[str, Any] = {
-        "frame_seq": report.frame_seq,
-        "kind": report.kind,
-        "age_ms": round((now_ns - report.frame_ns) / 1e6),
-        "detector_ms": round(1e3 * report.detector_s),
-    }
-    optional = {
-        "reason": report.reason or None,
-        "detail": report.detail or None,
-        "x_px": report.x_px,
-        "y_px": report.y_px,
-        "baseline_m": report.baseline_m,
-        "distance_m": report.distance_m,
-        "time_to_contact_frames": report.time_to_contact_frames,
-    }
-    for name, value in optional.items():
-        if value is not None:
-            fields[name] = round(value, 3) if isinstance(value, float) else value
-    return fields

@@ -181,7 +181,7 @@ class DetectorConfig(_Section):
     vehicle_height_m: Annotated[
         float,
         Field(gt=0, le=5, description="Height swept likewise, margins included (m)."),
-    ] = 0.4
+    ] = 0.6
     baseline_m: Annotated[
         float,
         Field(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.sim.world.furniture import MESHES
+from companion.sim.world.furniture_layers import LAYERS
 from companion.sim.world.model import Box, Furniture, Person, Pillar, Wall, World
 
 _PILLAR_SIDES: Final = 16
@@ -40,7 +41,7 @@ def prisms_of(world: World) -> tuple[Prism, ...]:
     """Return everything in a world that can be touched, except floor and ceiling.
 
     Pillars and people become polygons around their circle or ellipse (1.02 times as wide at most), furniture its
-    bounding box. Pictures are flat and are left out.
+    layers. Pictures are flat and are left out.
     """
     prisms: list[Prism] = []
     for wall in world.walls:
@@ -48,7 +49,8 @@ def prisms_of(world: World) -> tuple[Prism, ...]:
     prisms.extend(_box_prism(box) for box in world.boxes)
     prisms.extend(_pillar_prism(pillar, world.ceiling_m) for pillar in world.pillars)
     prisms.extend(_person_prism(person) for person in world.people)
-    prisms.extend(_furniture_prism(piece) for piece in world.furniture)
+    for piece in world.furniture:
+        prisms.extend(_furniture_prisms(piece))
     return tuple(prisms)
 
 
@@ -144,7 +146,20 @@ def _person_prism(person: Person) -> Prism:
     return Prism(outline, 0.0, person.height_m, "person")
 
 
-def _furniture_prism(piece: Furniture) -> Prism:
-    along_m, across_m, height_m = (piece.scale * size_m for size_m in MESHES[piece.kind].size_m)
-    outline = rectangle_m(piece.centre_m, along_m, across_m, math.radians(piece.yaw_deg))
-    return Prism(outline, 0.0, height_m, "furniture")
+def _furniture_prisms(piece: Furniture) -> tuple[Prism, ...]:
+    if piece.kind not in LAYERS:
+        along_m, across_m, height_m = (piece.scale * size_m for size_m in MESHES[piece.kind].size_m)
+        outline = rectangle_m(piece.centre_m, along_m, across_m, math.radians(piece.yaw_deg))
+        return (Prism(outline, 0.0, height_m, "furniture"),)
+    yaw_rad = math.radians(piece.yaw_deg)
+    ahead = np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
+    right = np.array([-ahead[1], ahead[0]])
+    return tuple(
+        Prism(
+            np.array(piece.centre_m) + piece.scale * (np.array(outline) @ np.stack([ahead, right])),
+            piece.scale * bottom_m,
+            piece.scale * top_m,
+            "furniture",
+        )
+        for bottom_m, top_m, outline in LAYERS[piece.kind]
+    )

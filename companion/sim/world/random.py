@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 
 from companion.errors import ConfigError
-from companion.sim.world.clearance import VEHICLE_RADIUS_M, Obstacles
+from companion.sim.world.clearance import VEHICLE_HALF_HEIGHT_M, VEHICLE_RADIUS_M, Obstacles
 from companion.sim.world.model import (
     Box,
     Furniture,
@@ -116,7 +116,12 @@ def random_world(seed: int, difficulty: Difficulty = "medium", radius_m: float =
         world = _furnished(plan, rng, level, f"random-{difficulty}-{seed}")
         if level.must_block and not _straight_line_blocked(world, radius_m):
             continue
-        route = find_route(world, radius_m + level.margin_m, grid_m=_GRID_M)
+        route = find_route(
+            world,
+            radius_m + level.margin_m,
+            half_height_m=VEHICLE_HALF_HEIGHT_M + level.margin_m,
+            grid_m=_GRID_M,
+        )
         if route is not None:
             points = tuple((round(north, 3), round(east, 3)) for north, east in route.points_m.tolist())
             return world.model_copy(update={"reference_path_m": points})

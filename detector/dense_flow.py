@@ -38,6 +38,9 @@ class DenseFlowParams:
         Of the grid, in the reduced image. Larger: fewer samples.
     round_trip_px
         There and back must end within this, in the reduced image.
+    off_line_px
+        A vector that leaves its epipolar line by more, where the picture fixes it in that direction too, is a wrong match or something
+        that moves.
     least_gradient
         Root mean square of the grey gradient along the epipolar line, grey values a reduced pixel. Larger: stricter.
     sigma_px
@@ -47,11 +50,12 @@ class DenseFlowParams:
     width_px: int = 320
     step_px: int = 6
     round_trip_px: float = 0.5
+    off_line_px: float = 2.0
     least_gradient: float = 4.0
     sigma_px: float = 0.45
 
     def __post_init__(self) -> None:
-        for name in ("width_px", "step_px", "round_trip_px", "least_gradient", "sigma_px"):
+        for name in ("width_px", "step_px", "round_trip_px", "off_line_px", "least_gradient", "sigma_px"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be above 0, found {getattr(self, name)}")
 
@@ -101,13 +105,18 @@ def grid_tracks(
         np.arange(half, size[0], params.step_px), np.arange(half, size[1], params.step_px)
     )
     end = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float32)
-    flow = back[rows.ravel(), columns.ravel()]
-    start = end + flow
+    along, across = _epipolar(end, small, translation_later)
+    found = back[rows.ravel(), columns.ravel()]
+    # An upright edge fixes the flow across itself only: what it says along the epipolar line counts, the rest is noise there.
+    start = (end + np.einsum("ij,ij->i", found, along)[:, None] * along).astype(np.float32)
     home = cv2.remap(forth, start[:, None, 0], start[:, None, 1], cv2.INTER_LINEAR).reshape(-1, 2)
     inside = cv2.remap(seen, start[:, None, 0], start[:, None, 1], cv2.INTER_NEAREST, borderValue=0.0)
-    believed = np.linalg.norm(flow + home, axis=1) < params.round_trip_px
+    believed = np.abs(np.einsum("ij,ij->i", found + home, along)) < params.round_trip_px
     believed &= inside.reshape(-1) > 0
-    believed &= _gradient_along(now, end, small, translation_later) > params.least_gradient
+    gradient_along, gradient_across = _gradients(now, end, along, across)
+    believed &= gradient_along > params.least_gradient
+    off_line = np.abs(np.einsum("ij,ij->i", found, across)) > params.off_line_px
+    believed &= ~(off_line & (gradient_across > params.least_gradient))
     to_full, offset = float(reduction), 0.5 * (reduction - 1)
     tracks = Tracks(
         start[believed].astype(np.float64) * to_full + offset,
@@ -138,21 +147,10 @@ def _turned(
     return np.asarray(turned, np.uint8), inside.astype(np.uint8) * 255
 
 
-def _gradient_along(
-    image: NDArray[np.uint8],
-    points_px: NDArray[np.float32],
-    camera: CameraModel,
-    translation_later: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the (N,) root mean square of the grey gradient along the epipolar line, about each point."""
-    d_x = cv2.Scharr(image, cv2.CV_32F, 1, 0, scale=1.0 / 32.0)
-    d_y = cv2.Scharr(image, cv2.CV_32F, 0, 1, scale=1.0 / 32.0)
-    window = (_WINDOW_PX, _WINDOW_PX)
-    column, row = points_px.T.astype(np.intp)
-    xx, xy, yy = (
-        np.asarray(cv2.blur(product, window), np.float64)[row, column]
-        for product in (d_x * d_x, d_x * d_y, d_y * d_y)
-    )
+def _epipolar(
+    points_px: NDArray[np.float32], camera: CameraModel, translation_later: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return unit vectors along and across the epipolar line at each point, (N, 2); zero on the focus of expansion itself."""
     rays = camera.pixel_to_ray(points_px)
     x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
     along = np.column_stack(
@@ -161,6 +159,29 @@ def _gradient_along(
             camera.fy_px * (translation_later[1] - y * translation_later[2]),
         ]
     )
-    length = np.linalg.norm(along, axis=1)
-    u, v = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0.0).T
-    return np.asarray(np.sqrt(np.maximum(0.0, u * u * xx + 2.0 * u * v * xy + v * v * yy)))
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along = np.divide(along, length, out=np.zeros_like(along), where=length > 0.0)
+    return along, np.column_stack([-along[:, 1], along[:, 0]])
+
+
+def _gradients(
+    image: NDArray[np.uint8],
+    points_px: NDArray[np.float32],
+    along: NDArray[np.float64],
+    across: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the (N,) root mean squares of the grey gradient in two directions, about each point."""
+    d_x = cv2.Scharr(image, cv2.CV_32F, 1, 0, scale=1.0 / 32.0)
+    d_y = cv2.Scharr(image, cv2.CV_32F, 0, 1, scale=1.0 / 32.0)
+    window = (_WINDOW_PX, _WINDOW_PX)
+    column, row = points_px.T.astype(np.intp)
+    xx, xy, yy = (
+        np.asarray(cv2.blur(product, window), np.float64)[row, column]
+        for product in (d_x * d_x, d_x * d_y, d_y * d_y)
+    )
+
+    def towards(unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        u, v = unit.T
+        return np.asarray(np.sqrt(np.maximum(0.0, u * u * xx + 2.0 * u * v * xy + v * v * yy)))
+
+    return towards(along), towards(across)

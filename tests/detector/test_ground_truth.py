@@ -177,4 +177,5 @@ def test_a_way_is_seen_where_there_is_one(scene: Scene, turn_deg: tuple[float, f
     assert isinstance(found, Direction)
     ray = later.world_from_camera @ CAMERA.pixel_to_ray([[found.x_px, found.y_px]])[0]
     towards = np.array([ray[0], ray[1], 0.0]) / math.hypot(ray[0], ray[1])
-    assert scene.range_along(later.position_m, towards) > 5.0
+    # Free for some metres. That it is the furthest way is more than the paper's method can say in a corridor (docs/presets.md).
+    assert scene.range_along(later.position_m, towards) > 3.0

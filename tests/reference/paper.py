@@ -35,6 +35,7 @@ class Kept(NamedTuple):
 class Settings:
     """The paper's numbers; pixel figures marked 1280 belong to its images of that width."""
 
+    sift_contrast: float = 0.04
     min_features: int = 100
     min_vectors: int = 100
     each_location_once: bool = False
@@ -105,6 +106,7 @@ def settings_of(params: Any) -> Settings:
     """Say to the oracle what a preset of the detector says, as far as the paper can be read that way."""
     by_ratio = params.plane_test != "deviation_px"
     return Settings(
+        sift_contrast=params.sift_contrast,
         min_features=params.min_features,
         min_vectors=params.min_flow_vectors,
         each_location_once=params.unique_locations,
@@ -208,7 +210,12 @@ def void_of_pair(
 
 
 def _key_points(image: NDArray[np.uint8], settings: Settings) -> list[tuple[float, float]]:
-    found = [key_point.pt for key_point in cv2.SIFT.create(nOctaveLayers=3).detect(image, None)]
+    found = [
+        key_point.pt
+        for key_point in cv2.SIFT.create(nOctaveLayers=3, contrastThreshold=settings.sift_contrast).detect(
+            image, None
+        )
+    ]
     return list(dict.fromkeys(found)) if settings.each_location_once else found
 
 

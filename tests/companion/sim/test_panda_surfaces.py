@@ -61,7 +61,7 @@ def test_the_texture_of_a_wall_goes_on_across_its_pieces() -> None:
 
 
 def test_what_is_seen_is_what_can_be_touched() -> None:
-    """Every prism that a vehicle could hit has the same bounding box as what is drawn for it."""
+    """Everything that a vehicle could hit has the same bounding box as what is drawn for it, furniture with all its layers."""
     world = World(
         name="w",
         start=Start(north_m=0.0, east_m=0.0),
@@ -78,15 +78,23 @@ def test_what_is_seen_is_what_can_be_touched() -> None:
         ),
     )
     drawn = np.concatenate([surface.position_ned_m for surface in world_surfaces(world)[2:]])
-    for prism in prisms_of(world):
-        low, high = prism.outline_m.min(axis=0), prism.outline_m.max(axis=0)
+    nothing = {"walls": (), "pillars": (), "people": ()}
+    solid = prisms_of(world)
+    alone = [(prism,) for prism in solid if prism.kind != "furniture"]
+    layered = [
+        prisms_of(world.model_copy(update={**nothing, "furniture": (piece,)})) for piece in world.furniture
+    ]
+    for prisms in (*alone, *layered):
+        outlines = np.concatenate([prism.outline_m for prism in prisms])
+        low, high = outlines.min(axis=0), outlines.max(axis=0)
+        bottom_m, top_m = prisms[0].bottom_m, prisms[-1].top_m
         inside = ((drawn[:, :2] > low - 0.02) & (drawn[:, :2] < high + 0.02)).all(axis=1)
-        inside &= (-drawn[:, 2] > prism.bottom_m - 0.02) & (-drawn[:, 2] < prism.top_m + 0.02)
+        inside &= (-drawn[:, 2] > bottom_m - 0.02) & (-drawn[:, 2] < top_m + 0.02)
         points = drawn[inside]
-        np.testing.assert_allclose(points[:, :2].min(axis=0), low, atol=0.03, err_msg=prism.kind)
-        np.testing.assert_allclose(points[:, :2].max(axis=0), high, atol=0.03, err_msg=prism.kind)
-        assert -points[:, 2].max() == pytest.approx(prism.bottom_m, abs=0.02)
-        assert -points[:, 2].min() == pytest.approx(prism.top_m, abs=0.02)
+        np.testing.assert_allclose(points[:, :2].min(axis=0), low, atol=0.03, err_msg=prisms[0].kind)
+        np.testing.assert_allclose(points[:, :2].max(axis=0), high, atol=0.03, err_msg=prisms[0].kind)
+        assert -points[:, 2].max() == pytest.approx(bottom_m, abs=0.02)
+        assert -points[:, 2].min() == pytest.approx(top_m, abs=0.02)
 
 
 def test_only_what_looks_alike_is_joined() -> None:

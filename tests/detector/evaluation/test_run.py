@@ -242,7 +242,7 @@ def test_images_turned_back_give_the_same_focus_as_the_rotation(tmp_path):
     said = real("", images, derotated=True, poses="none")
     assert said["images"] == "derotated"
     assert said["foe"]["n"] >= 2
-    assert said["foe"]["median_px"] < 30.0
+    assert said["foe"]["median_px"] < 35.0  # at steps of 0.1 m, three pairs
 
 
 def test_pairs_formed_from_poses_have_their_focus_from_the_poses():

@@ -57,7 +57,7 @@ class DetectorParams(BaseModel):
             le=48,
             description="fast: parts (of 48) of each frame that are looked at anew for key points. Larger: slower; new things come in sooner.",
         ),
-    ] = 4
+    ] = 2
     fast_restarts: Annotated[
         int, Field(ge=1, le=100, description="fast: k-means runs for each n in the first loop.")
     ] = 6

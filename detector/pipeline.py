@@ -38,7 +38,7 @@ Timer = Callable[[], float]
 _ASSUMED_HFOVS_DEG: Final = range(45, 111, 5)
 """Fields of view tried by the check on pure rotation where no camera is known: the one that explains most counts. Ten degrees
 beside the truth, a turn of 4 degrees leaves more flow behind than a camera's motion would."""
-_ROTATION_TRACKS: Final = 150
+_ROTATION_TRACKS: Final = 80
 """fast: about so many vectors are asked whether the camera only turned."""
 _MIN_TRACKS: Final = 10
 """Fewer vectors than this say nothing about motion."""

@@ -221,3 +221,17 @@ def test_a_sensor_in_a_world_sees_it(ideal: PandaCamera) -> None:
 def test_a_sensor_refuses_what_makes_no_sense(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         SensorCamera(Counted(), **{"effects": ImageEffects(), "seed": 0, "frame_period_s": 0.1, **wrong})
+
+
+def test_automatic_exposure_brings_a_dark_picture_to_its_mean_and_spares_bright_parts() -> None:
+    effects = ImageEffects(metered_grey=130.0, vignetting=0.0, read_noise_grey=0.0, shot_noise_grey=0.0)
+    rng = np.random.default_rng(0)
+    dark = np.full((60, 80), 50, np.uint8)
+    assert sensed(dark, effects, rng).mean() == pytest.approx(130.0, abs=1.0)
+    with_window = dark.copy()
+    with_window[:, :16] = 200  # a fifth of the picture: metering the mean alone would burn it out
+    assert sensed(with_window, effects, rng).max() == pytest.approx(240, abs=1)
+    nearly_black = np.full((60, 80), 4, np.uint8)
+    assert sensed(nearly_black, effects, rng).max() == 16  # four times is all the gain there is
+    black = np.zeros((60, 80), np.uint8)
+    assert sensed(black, effects, rng).max() == 0

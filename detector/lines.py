@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from detector.params import DetectorParams, scaled_px
+
 _VOTES_MIN = 5
 """Fewer votes than this find lines in noise."""
 
@@ -168,3 +170,31 @@ def lower_half_lines(
         else:
             high = middle
     return best
+
+
+def lines_by(params: DetectorParams, image: NDArray[np.uint8], known_votes: int | None = None) -> Lines:
+    """Return :func:`lower_half_lines` with a detector's settings, its pixel figures scaled to the image.
+
+    Parameters
+    ----------
+    params
+        Settings of edges, Hough transform and angles.
+    image
+        (H, W) uint8, the whole second frame.
+    known_votes
+        As :func:`lower_half_lines` takes it.
+    """
+    width_px = image.shape[1]
+    return lower_half_lines(
+        image,
+        HoughSettings(
+            votes=max(1, round(scaled_px(params.hough_votes_at_1280, width_px))),
+            min_length_px=scaled_px(params.hough_min_length_px_at_1280, width_px),
+            max_gap_px=scaled_px(params.hough_max_gap_px_at_1280, width_px),
+        ),
+        AngleGate(params.line_angle_min_deg, params.line_angle_max_deg, params.vertical_gap_deg),
+        edge_low=params.edge_low,
+        edge_high=params.edge_high,
+        wanted=params.lines_wanted,
+        known_votes=known_votes,
+    )

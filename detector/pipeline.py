@@ -523,21 +523,7 @@ class VoidDetector:
     ) -> NDArray[np.float64]:
         params = self.params
         height_px, width_px = later.shape
-        settings = lines.HoughSettings(
-            votes=max(1, round(scaled_px(params.hough_votes_at_1280, width_px))),
-            min_length_px=scaled_px(params.hough_min_length_px_at_1280, width_px),
-            max_gap_px=scaled_px(params.hough_max_gap_px_at_1280, width_px),
-        )
-        gate = lines.AngleGate(params.line_angle_min_deg, params.line_angle_max_deg, params.vertical_gap_deg)
-        segments, n_lines, votes = lines.lower_half_lines(
-            later,
-            settings,
-            gate,
-            edge_low=params.edge_low,
-            edge_high=params.edge_high,
-            wanted=params.lines_wanted,
-            known_votes=self._votes,
-        )
+        segments, n_lines, votes = lines.lines_by(params, later, self._votes)
         if params.speed == "fast":
             self._votes = votes
         found = vanishing_point.candidates(

@@ -70,11 +70,13 @@ class SeedFinder:
         """Return the number of locations in a frame, or at least ``least`` where a reduced frame holds as many."""
         found = 0
         for reduction in (4, 2, 1):
-            if reduction == 1 or image.shape[1] >= reduction * _LEAST_WIDTH_PX:
+            if reduction == 1:
+                found = len(self._locations(image))
+            elif image.shape[1] >= reduction * _LEAST_WIDTH_PX:
                 height, width = image.shape
-                size = (max(1, width // reduction), max(1, height // reduction))
+                size = (width // reduction, max(1, height // reduction))
                 reduced = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-                found = len(self._locations(image if reduction == 1 else reduced))
+                found = len(self._locations(reduced))
             if found >= least:
                 break
         return found

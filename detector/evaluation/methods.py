@@ -14,7 +14,7 @@ from detector import lines, vanishing_point
 from detector.camera_model import CameraModel
 from detector.expansion import fit_focus_of_expansion, ideal_px
 from detector.flow import Tracks
-from detector.params import DetectorParams, scaled_px
+from detector.params import DetectorParams
 from detector.pipeline import VoidDetector
 from detector.results import Detection, Direction, NoDetection
 
@@ -189,18 +189,7 @@ def line_vanishing_point(image: NDArray[np.uint8], params: DetectorParams) -> tu
         Its settings of edges, Hough transform and intersections.
     """
     height_px, width_px = image.shape
-    segments, *_ = lines.lower_half_lines(
-        image,
-        lines.HoughSettings(
-            votes=max(1, round(scaled_px(params.hough_votes_at_1280, width_px))),
-            min_length_px=scaled_px(params.hough_min_length_px_at_1280, width_px),
-            max_gap_px=scaled_px(params.hough_max_gap_px_at_1280, width_px),
-        ),
-        lines.AngleGate(params.line_angle_min_deg, params.line_angle_max_deg, params.vertical_gap_deg),
-        edge_low=params.edge_low,
-        edge_high=params.edge_high,
-        wanted=params.lines_wanted,
-    )
+    segments, *_ = lines.lines_by(params, image)
     found = vanishing_point.candidates(
         segments,
         np.array([[0.5 * (width_px - 1), 0.5 * (height_px - 1)]]),

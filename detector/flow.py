@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from detector.params import DetectorParams
+
 
 class Camera(Protocol):
     """What the flow asks of a camera model."""
@@ -126,6 +128,26 @@ def track(
     ends = np.asarray(found, dtype=np.float32).reshape(-1, 2)
     ok = (np.asarray(status).reshape(-1) == 1) & np.isfinite(ends).all(axis=1)
     return ends, ok
+
+
+def track_by(
+    params: DetectorParams,
+    from_image: NDArray[np.uint8],
+    to_image: NDArray[np.uint8],
+    points_px: NDArray[np.floating],
+    guess_px: NDArray[np.floating] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return :func:`track` with a detector's settings of Lucas-Kanade."""
+    return track(
+        from_image,
+        to_image,
+        points_px,
+        window_px=params.lk_window_px,
+        levels=params.lk_levels,
+        iterations=params.lk_iterations,
+        epsilon_px=params.lk_epsilon_px,
+        guess_px=guess_px,
+    )
 
 
 def distribution_filter(

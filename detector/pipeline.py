@@ -278,32 +278,15 @@ class VoidDetector:
         """Track there and back; return the N' vectors as seen, and with the rotation taken out."""
         params = self.params
 
-        def follow(
-            a: NDArray[np.uint8],
-            b: NDArray[np.uint8],
-            at: NDArray[np.float32],
-            guess: NDArray[np.float64] | None,
-        ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-            return flow.track(
-                a,
-                b,
-                at,
-                window_px=params.lk_window_px,
-                levels=params.lk_levels,
-                iterations=params.lk_iterations,
-                epsilon_px=params.lk_epsilon_px,
-                guess_px=guess,
-            )
-
         with notes.step("flow"):
             guess_there: NDArray[np.float64] | None = None
             if camera is not None and later_from_earlier is not None and params.lk_predict_rotation:
                 predicted = flow.derotate(points, camera, later_from_earlier)
                 guess_there = np.where(np.isfinite(predicted), predicted, points)
-            ends, there = follow(earlier, later, points, guess_there)
+            ends, there = flow.track_by(params, earlier, later, points, guess_there)
             # What was not found there cannot come back; its end stands for it so that the arrays stay aligned.
             guess_back = None if guess_there is None else np.asarray(points, np.float64)
-            returned, back = follow(later, earlier, ends, guess_back)
+            returned, back = flow.track_by(params, later, earlier, ends, guess_back)
             home = flow.distribution_filter(points, returned, params.round_trip_px)
             kept: NDArray[np.bool_] = there & back & home
             raw = Tracks(points[kept].astype(np.float64), ends[kept].astype(np.float64))

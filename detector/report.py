@@ -179,24 +179,6 @@ def _followed(
     pair: Pair, seeds_px: NDArray[np.float32], params: DetectorParams
 ) -> tuple[Tracks, NDArray[np.bool_]]:
     """Return the N vectors and which of them came back to where they started."""
-
-    def follow(
-        a: NDArray[np.uint8],
-        b: NDArray[np.uint8],
-        at: NDArray[np.float32],
-        guess: NDArray[np.float64] | None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        return flow.track(
-            a,
-            b,
-            at,
-            window_px=params.lk_window_px,
-            levels=params.lk_levels,
-            iterations=params.lk_iterations,
-            epsilon_px=params.lk_epsilon_px,
-            guess_px=guess,
-        )
-
     starts = np.asarray(seeds_px, np.float64)
     guess_there = guess_back = None
     if pair.camera is not None and pair.later_from_earlier is not None:
@@ -204,8 +186,8 @@ def _followed(
         if params.lk_predict_rotation:
             guess_there = np.where(np.isfinite(starts), starts, seeds_px)
             guess_back = np.asarray(seeds_px, np.float64)
-    ends, there = follow(pair.earlier, pair.later, seeds_px, guess_there)
-    returned, back = follow(pair.later, pair.earlier, ends, guess_back)
+    ends, there = flow.track_by(params, pair.earlier, pair.later, seeds_px, guess_there)
+    returned, back = flow.track_by(params, pair.later, pair.earlier, ends, guess_back)
     home = back & flow.distribution_filter(seeds_px, returned, params.round_trip_px)
     there = there & np.isfinite(starts).all(axis=1)
     return Tracks(starts[there], ends[there].astype(np.float64)), np.asarray(home[there], np.bool_)

@@ -1,0 +1,79 @@
+"""``[detector]``: the detector in its worker process."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from companion.config.section import Disagreement, Section
+
+
+class DetectorConfig(Section):
+    """The detector in its worker process."""
+
+    preset: Annotated[
+        Literal["default", "paper"],
+        Field(description="Parameter set: default (measured best) or paper (literal)."),
+    ] = "default"
+    params_file: Annotated[
+        str,
+        Field(
+            description="TOML file with detector parameters that replace those of the preset; empty: none."
+        ),
+    ] = ""
+    deadline_s: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=60,
+            description="A pair that takes longer counts as hung: the worker is killed and restarted.",
+        ),
+    ] = 10.0
+    start_timeout_s: Annotated[
+        float, Field(gt=0, le=300, description="Time allowed for the worker to start (imports included).")
+    ] = 60.0
+    restart_delay_s: Annotated[
+        float,
+        Field(gt=0, le=60, description="First delay before a restart; doubles up to restart_delay_max_s."),
+    ] = 0.2
+    restart_delay_max_s: Annotated[
+        float, Field(gt=0, le=600, description="Longest delay between restarts.")
+    ] = 5.0
+    vehicle_width_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=5,
+            description="Width swept along a direction to find its free distance, margins included (m). Larger: fewer ways count as free.",
+        ),
+    ] = 0.9
+    vehicle_height_m: Annotated[
+        float,
+        Field(gt=0, le=5, description="Height swept likewise, margins included (m)."),
+    ] = 0.6
+    baseline_m: Annotated[
+        float,
+        Field(
+            ge=0.02,
+            le=2,
+            description="Distance flown between the two frames of a pair that is aimed at (m); 0.4 to 1.8 times of it is taken. Larger: surer ranges, fewer tracks that survive.",
+        ),
+    ] = 0.25
+    threads: Annotated[
+        int,
+        Field(
+            ge=1, le=64, description="OpenCV and BLAS threads of the worker. Leave one core to the service."
+        ),
+    ] = 1
+
+    def _disagreements(self) -> tuple[Disagreement, ...]:
+        if self.restart_delay_s <= self.restart_delay_max_s:
+            return ()
+        return (
+            Disagreement(
+                "restart_delay_s",
+                str(self.restart_delay_s),
+                f"at most restart_delay_max_s, which is {self.restart_delay_max_s}",
+            ),
+        )

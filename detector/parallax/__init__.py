@@ -1,0 +1,1 @@
+"""Void detection from parallax: rotation taken out, ranges by sample, a map of where the vehicle fits."""

@@ -10,6 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from structlog import make_filtering_bound_logger, wrap_logger
 from structlog.testing import CapturingLogger
 
 from companion.clock import RealClock
@@ -53,13 +54,26 @@ class SteppedClock:
         await asyncio.sleep(0)
 
 
+def capturing_log():
+    """Return a log as the service has it, and the list that its events go to; a bare CapturingLogger cannot bind."""
+    captured = CapturingLogger()
+
+    def as_call(logger, method, event):
+        return (event.pop("event"),), event
+
+    log = wrap_logger(
+        captured, processors=[as_call], wrapper_class=make_filtering_bound_logger("info"), context_class=dict
+    )
+    return log.bind(), captured
+
+
 def parts(clock, config: Config):
-    log = CapturingLogger()
-    service = Service(config, clock=clock, log=log)
+    bound, log = capturing_log()
+    service = Service(config, clock=clock, log=bound)
     sink = Sink()
-    flight = Interception(config, identity=Identity(sink, Sink(), now_ns=clock.now_ns), log=log)
+    flight = Interception(config, identity=Identity(sink, Sink(), now_ns=clock.now_ns), log=bound)
     vision = VisionSupervisor(
-        config.detector, config.camera, clock=clock, on_report=lambda report: None, log=log
+        config.detector, config.camera, clock=clock, on_report=lambda report: None, log=bound
     )
     return service, flight, vision, log, sink
 
@@ -149,7 +163,7 @@ async def test_a_recording_that_has_ended_is_a_fault_that_stays(tmp_path):
 
 async def test_a_recording_that_is_not_there_ends_the_start_with_its_name(tmp_path):
     config = Config(link=LINKS, source=SourceConfig(path=str(tmp_path / "absent.mp4")))
-    service = Service(config, clock=RealClock(), log=CapturingLogger())
+    service = Service(config, clock=RealClock(), log=capturing_log()[0])
     with pytest.raises(ExceptionGroup) as caught:
         await asyncio.wait_for(service.run(), 20)
     assert caught.group_contains(SourceError, match="absent.mp4")
@@ -162,10 +176,28 @@ async def test_a_stop_ends_it_within_two_seconds_also_while_source_and_worker_st
         silent.listen()
         address = f"127.0.0.1:{silent.getsockname()[1]}"
         config = Config(link=LINKS, source=SourceConfig(kind="socket", address=address))
-        service = Service(config, clock=RealClock(), log=CapturingLogger())
+        service = Service(config, clock=RealClock(), log=capturing_log()[0])
         running = asyncio.create_task(service.run())
         await asyncio.sleep(after_s)
         asked = time.monotonic()
         service.stop()
         await asyncio.wait_for(running, 10)
         assert time.monotonic() - asked < 2.0
+
+
+async def test_a_sender_that_is_silent_until_the_end_is_announced_with_its_name():
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        config = Config(link=LINKS, source=SourceConfig(kind="socket", address=address, timeout_s=0.05))
+        log, captured = capturing_log()
+        service = Service(config, clock=RealClock(), log=log)
+        running = asyncio.create_task(service.run())
+        for _ in range(2000):
+            if lost := [call for call in captured.calls if call.args == ("frame_stream_lost",)]:
+                break
+            await asyncio.sleep(0.01)
+        service.stop()
+        await asyncio.wait_for(running, 10)
+    assert lost[0].kwargs == {"source": address, "reason": "nothing for 0.05 s"}

@@ -13,6 +13,9 @@ from companion.guidance.situation import Evidence, Situation, remaining_m
 from companion.guidance.table import LOOK_AGAIN, State, Table
 from companion.guidance.wish import Wish
 
+_NARROW_M = 0.6
+_NARROW_STEP_M = 0.8
+"""Longest step where something is remembered this near beside the way: slower between the jambs of a door."""
 _COMMAND_RECENT_NS = 500_000_000
 _MAX_SLEW_DT_S = 0.2
 _MAX_YAW_LEAD_RAD = math.radians(30.0)
@@ -102,6 +105,10 @@ class Command:
         plan = self._plan
         if state is State.FOLLOW:
             return self._follow(s)
+        if state is State.STEER and s.gap is not None:
+            psi, room_m = self._evidence.seen.clearer(s.gap.azimuth_rad(s.pose), s.pose, s.now_ns)
+            longest_m = min(s.gap.left_m(s.pose), _NARROW_STEP_M if room_m < _NARROW_M else math.inf)
+            return self._steer(s, psi, self._evidence.free_m(psi, s.pose, s.now_ns), longest_m)
         if state is State.STEER and s.answer is not None:
             return self._steer(s, s.answer.azimuth_rad, self._evidence.void_free_m(s.answer, s))
         if state is State.PROBE:
@@ -125,8 +132,8 @@ class Command:
         self.yaw.commanded(self._plan.anchor_yaw_rad, now_ns)
         return Rewrite(*self._plan.anchor, self._plan.anchor_yaw_rad, "held", self._plan.anchor_down_m)
 
-    def _steer(self, s: Situation, psi: float, free_m: float | None) -> Decision:
-        step_m = self._step_m(s.goal_m, free_m)
+    def _steer(self, s: Situation, psi: float, free_m: float | None, longest_m: float = math.inf) -> Decision:
+        step_m = min(self._step_m(s.goal_m, free_m), longest_m)
         out_of_sight = abs(wrap_rad(psi - s.look_rad)) > math.radians(self._config.align_deg)
         if out_of_sight or self._table.choose(s)[1] == LOOK_AGAIN:
             # The camera must look where it flies, and no way is open before it is seen again.

@@ -79,6 +79,10 @@ class SeenBearings:
             found = free_m if found is None else min(found, free_m)
         return found
 
+    def clearer(self, azimuth_rad: float, pose: Pose, now_ns: int) -> tuple[float, float]:
+        """Return the azimuth near a wanted one with most room beside what is remembered, and that room (m)."""
+        return self._near.clearer(azimuth_rad, pose, now_ns)
+
     def free_azimuths(
         self, at_least_m: float, pose: Pose, speed_m_s: float, now_ns: int
     ) -> list[tuple[float, float]]:
@@ -174,6 +178,11 @@ class Episode:
     def is_blocked(self, azimuth_rad: float, within_rad: float = math.radians(15.0)) -> bool:
         """Whether a bearing close to this one was found blocked in this episode."""
         return any(abs(wrap_rad(b.azimuth_rad - azimuth_rad)) <= within_rad for b in self._blocked)
+
+    @property
+    def blocked_rad(self) -> tuple[float, ...]:
+        """Azimuths that were found blocked in this episode."""
+        return tuple(b.azimuth_rad for b in self._blocked)
 
     def bootstrap(self, look_rad: float) -> None:
         """Remember that a blind step was taken at this heading."""

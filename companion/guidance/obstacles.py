@@ -16,6 +16,13 @@ _CLOSING = 0.9
 """A way that brings the vehicle no nearer than this share of the present distance does not approach."""
 
 
+_AHEAD_M = 1.5
+_ROOM_M = 0.8
+_SIDESTEP_RAD = math.radians(3.0)
+_ROOM_PER_RAD_M = 0.4
+"""A deviation of one radian must bring this much more room."""
+
+
 @dataclass(slots=True)
 class _Cell:
     north_m: float
@@ -73,6 +80,55 @@ class NearObstacles:
                 continue
             nearest = along_m if nearest is None else min(nearest, along_m)
         return nearest
+
+    def clearer(self, azimuth_rad: float, pose: Pose, now_ns: int) -> tuple[float, float]:
+        """Return the azimuth near a wanted one that keeps most room beside remembered obstacles, and that room.
+
+        A doorway's frame is out of view while the vehicle passes it; between two remembered edges this is the middle.
+
+        Parameters
+        ----------
+        azimuth_rad
+            The wanted one.
+        pose
+            The vehicle's.
+        now_ns
+            Our monotonic time.
+
+        Returns
+        -------
+        The azimuth (rad), at most 21 degrees from the wanted one, and the least distance (m) from its line to an obstacle
+        within the next 1.5 m, at most 0.8 m.
+        """
+        self._forget(pose, now_ns)
+        near = [
+            (cell.north_m - pose.north_m, cell.east_m - pose.east_m)
+            for cell in self._cells.values()
+            if cell.sightings >= _SIGHTINGS
+            and math.hypot(cell.north_m - pose.north_m, cell.east_m - pose.east_m) <= _AHEAD_M + _ROOM_M
+        ]
+
+        def room_m(azimuth: float) -> float:
+            cos, sin = math.cos(azimuth), math.sin(azimuth)
+            least = _ROOM_M
+            for north_m, east_m in near:
+                along_m = north_m * cos + east_m * sin
+                if 0.0 < along_m <= _AHEAD_M:
+                    least = min(least, abs(east_m * cos - north_m * sin))
+            return least
+
+        wanted_m = room_m(azimuth_rad)
+        if wanted_m >= _ROOM_M:
+            return azimuth_rad, wanted_m
+        offers = [
+            azimuth_rad + math.copysign(step * _SIDESTEP_RAD, side)
+            for step in range(1, 8)
+            for side in (1, -1)
+        ]
+        rooms = [(wanted_m, azimuth_rad), *((room_m(offer), offer) for offer in offers)]
+        # The nearest azimuth wins unless another gives clearly more room for its deviation.
+        best_m, best = max(rooms, key=lambda r: r[0] - _ROOM_PER_RAD_M * abs(r[1] - azimuth_rad))
+        return best, best_m
 
     def _forget(self, pose: Pose, now_ns: int) -> None:
         here = (pose.north_m, pose.east_m)

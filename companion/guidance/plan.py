@@ -12,6 +12,8 @@ from companion.guidance.situation import Evidence
 
 TURN_DONE_RAD = math.radians(5.0)
 """A turn that is this close to its end is done."""
+_CLEARLY_M = 0.7
+"""A side is freer than the other where it leads this much further."""
 _DEAD_AHEAD_RAD = math.radians(5.0)
 _ALIGN_SPARE_RAD = math.radians(30.0)
 _SAME_DIRECTION_RAD = math.radians(15.0)
@@ -92,16 +94,14 @@ class Plan:
             return False
         return abs(wrap_rad(body_bearing_rad - self.turns_along_rad)) <= _SAME_DIRECTION_RAD
 
-    def begin_turn(self, pose: Pose) -> None:
+    def begin_turn(self, pose: Pose, now_ns: int) -> None:
         """Choose the side, once for an episode, and where the next step of the turn ends."""
         episode = self.episode
         if episode is None:
             return
         look = self._evidence.look_rad(pose)
         if episode.side == 0:
-            bearing = self._goal_bearing_rad(pose)
-            to_goal = 0.0 if bearing is None else wrap_rad(bearing - look)
-            episode.side = -1 if to_goal < -_DEAD_AHEAD_RAD else 1
+            episode.side = self._freer_side(pose, look, now_ns) or self._goal_side(pose, look)
         # From where the last turn was to end, not from where it was found done: twelve steps of 30 are 360.
         goes_on = episode.sweep_rad > 0 and abs(wrap_rad(self.turn_target_rad - look)) <= 2 * TURN_DONE_RAD
         start = self.turn_target_rad if goes_on else look
@@ -147,6 +147,24 @@ class Plan:
         if config.bootstrap_probe and not blocked and not used:
             return "camera axis", along(look_rad)
         return None
+
+    def _goal_side(self, pose: Pose, look_rad: float) -> int:
+        bearing = self._goal_bearing_rad(pose)
+        to_goal = 0.0 if bearing is None else wrap_rad(bearing - look_rad)
+        return -1 if to_goal < -_DEAD_AHEAD_RAD else 1
+
+    def _freer_side(self, pose: Pose, look_rad: float, now_ns: int) -> int:
+        """Return the side on which a way is measured to lead clearly further, 0 where there is none."""
+        evidence = self._evidence
+        furthest = {-1: 0.0, 1: 0.0}
+        for azimuth, free_m in evidence.seen.free_azimuths(0.0, pose, evidence.speed_m_s, now_ns):
+            off_rad = wrap_rad(azimuth - look_rad)
+            side = 1 if off_rad > 0 else -1
+            if abs(off_rad) <= math.pi / 2:
+                furthest[side] = max(furthest[side], free_m)
+        if abs(furthest[1] - furthest[-1]) < _CLEARLY_M:
+            return 0
+        return 1 if furthest[1] > furthest[-1] else -1
 
     def _goal_bearing_rad(self, pose: Pose) -> float | None:
         goal = self._evidence.goal.position

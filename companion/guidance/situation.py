@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from companion.config import GuidanceConfig
 from companion.guidance.coordinates import azimuth_of_body_ray, heading_rad, wrap_rad
 from companion.guidance.freshness import expiry
+from companion.guidance.gaps import Gap, Gaps
 from companion.guidance.goal import Goal
 from companion.guidance.memory import SeenBearings, Track
 from companion.guidance.observation import DetectionReport, Pose
@@ -22,6 +23,10 @@ _NO_PARALLAX = ("no_motion", "no_earlier_frame")
 """Reasons of the detector that say nothing about the scene: the last answer stays and ages."""
 _MIN_STEP_M = 0.2
 """A way that is not free for this much (beyond the margin) is blocked."""
+_MIN_GAP_M = 1.2
+"""A way that leads less far beyond its margin is no gap to fly to."""
+_DETOUR_M = 0.7
+"""A gap is flown to where it leads nearer to the goal than the straight way by more than this."""
 _ARRIVED_FACTOR = 1.5
 """Once arrived, the goal stays reached up to this many arrival radii: a hovering vehicle wanders."""
 _FUTURE_NS = 100_000_000
@@ -79,6 +84,8 @@ class Situation:
         What stands in the way, where enough answers say so.
     free_bearing_m
         Free distance known along the bearing.
+    gap
+        A way seen lately that leads further than the goal's bearing, where there is one.
     """
 
     now_ns: int
@@ -96,6 +103,7 @@ class Situation:
     no_answer: str
     wall: str | None
     free_bearing_m: float | None
+    gap: Gap | None = None
 
 
 class Evidence:
@@ -124,7 +132,10 @@ class Evidence:
         self.votes: deque[DetectionReport | None] = deque(maxlen=config.wall_n)
         self.seen = SeenBearings(config, vehicle_width_m)
         self.track = Track()
+        self.gaps = Gaps(margin_m=config.step_margin_m, least_m=_MIN_GAP_M)
+        self.blocked: tuple[float, ...] = ()
         self._bad_reports = 0
+        self._blind_reports = 0
         self._answers_after_ns = -(1 << 62)
         self._pairs_after_ns = -(1 << 62)
         self._arrived = False
@@ -147,18 +158,26 @@ class Evidence:
         self.newest_frame_ns = report.frame_ns
         self.last_report_ns = now_ns
         self.last_report = report
+        is_of_this_frame = (
+            _pair_began_ns(report) >= self._pairs_after_ns
+        )  # else the way flown in it is not known
+        if report.pose is not None and report.frame_ns >= self._answers_after_ns and is_of_this_frame:
+            # Ranges stand for themselves: they may be known where the picture has too little for a direction.
+            self.seen.add(report)
+            self._note_gaps(report, now_ns)
+        if report.bearings:
+            self._blind_reports = 0
+        elif report.kind != "none" or report.reason not in _NO_PARALLAX:
+            self._blind_reports += 1
         if report.kind == "none":
             if report.reason not in _NO_PARALLAX:
                 self._bad_reports += 1
                 if self._bad_reports >= self._config.bad_reports_to_hold:
                     self.answer = None
             return
-        if report.frame_ns < self._answers_after_ns or report.pose is None:
+        if report.frame_ns < self._answers_after_ns or report.pose is None or not is_of_this_frame:
             return
-        if _pair_began_ns(report) < self._pairs_after_ns:
-            return  # its two poses are not of one local frame: the way flown between them is not known
         self._bad_reports = 0
-        self.seen.add(report)
         if report.kind == "single_plane":
             self.votes.append(report)
             if report.distance_m is not None and report.distance_m > self._wall_range_m(math.inf):
@@ -172,6 +191,16 @@ class Evidence:
         self.answer = Answer(report, azimuth, is_plane=False)
         self.votes.append(report if self._is_boxed_in(azimuth, now_ns) else None)
 
+    def _note_gaps(self, report: DetectionReport, now_ns: int) -> None:
+        pose, goal = report.pose, self.goal.position
+        if pose is None or goal is None:
+            return
+        kept = self.gaps.usable(pose, now_ns)
+        way_free_m = None
+        if kept is not None:
+            way_free_m = self.seen.free_m(kept.azimuth_rad(pose), pose, self.speed_m_s, now_ns)
+        self.gaps.add(report, goal, blocked=self.blocked, anywhere=bool(self.blocked), way_free_m=way_free_m)
+
     # ------------------------------------------------------------------ what is forgotten
 
     def take_answers_after(self, now_ns: int) -> None:
@@ -184,6 +213,7 @@ class Evidence:
         """Forget what was measured free; what was seen to stand somewhere nearby still counts."""
         self.take_answers_after(now_ns)
         self.seen.forget_ranges()
+        self.gaps.forget()
 
     def drop_local_frame(self, now_ns: int) -> None:
         """Forget all that was measured in a local frame that is no longer (estimator reset)."""
@@ -199,6 +229,7 @@ class Evidence:
         self.answer = None
         self.votes.clear()
         self.seen.clear()
+        self.gaps.forget()
         self.track.clear()
         self.goal.forget()
         self._arrived = False
@@ -213,6 +244,10 @@ class Evidence:
         """Whether the last picture could not be used, for another reason than lack of motion."""
         last = self.last_report
         return last is not None and last.kind == "none" and last.reason not in _NO_PARALLAX
+
+    def sees_ranges(self) -> bool:
+        """Whether the last pictures told distances: without, what was measured before is not gone by for long."""
+        return self._blind_reports < self._config.bad_reports_to_hold
 
     def situation(self, wish: Wish, goal: tuple[float, float], pose: Pose, now_ns: int) -> Situation:
         """Return what is true now for one setpoint of the planner, whose goal is known."""
@@ -247,7 +282,18 @@ class Evidence:
             no_answer=no_answer,
             wall=wall,
             free_bearing_m=free_bearing_m,
+            gap=self._better_gap(goal, goal_m, free_bearing_m, pose, now_ns),
         )
+
+    def _better_gap(
+        self, goal: tuple[float, float], goal_m: float, free_m: float | None, pose: Pose, now_ns: int
+    ) -> Gap | None:
+        """Return the gap kept, where it leads further than the goal's own bearing."""
+        gap = self.gaps.usable(pose, now_ns) if self.sees_ranges() else None
+        if gap is None or self.blocked or free_m is None:
+            return gap
+        straight_m = min(goal_m, max(0.0, free_m - self._config.step_margin_m))
+        return gap if gap.nearer_m(goal, pose) > straight_m + _DETOUR_M else None
 
     def free_m(self, azimuth_rad: float, pose: Pose, now_ns: int) -> float | None:
         """Return the free distance known along an azimuth, or None."""

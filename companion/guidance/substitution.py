@@ -28,7 +28,7 @@ from companion.guidance.observation import DetectionReport, Pose
 from companion.guidance.plan import Plan
 from companion.guidance.setpoint import Decision, Drop, Forward, Stay
 from companion.guidance.situation import Evidence, Situation
-from companion.guidance.table import HELD_STATES, NO_WAY_OUT, Standing, State, Table
+from companion.guidance.table import GAP_SEEN, HELD_STATES, NO_WAY_OUT, Standing, State, Table
 from companion.guidance.wish import Wish
 
 __all__ = ["Event", "GaveUp", "State", "StateChanged", "Switch"]
@@ -248,10 +248,10 @@ class Switch:
             plan.anchor_yaw_rad = heading_rad(pose.q_ned_from_body)
         if state is State.STEER:
             plan.steer_start = (pose.north_m, pose.east_m)
-        if state in (State.STEER, State.TURN):
+        if state is State.TURN or (state is State.STEER and reason != GAP_SEEN):
             plan.begin_or_keep_episode(pose)
         if state is State.TURN:
-            plan.begin_turn(pose)
+            plan.begin_turn(pose, now_ns)
         if state is State.PROBE:
             plan.begin_probe(pose, now_ns)
 
@@ -287,6 +287,9 @@ class Switch:
         pose = self._evidence.pose
         if pose is not None:
             self._plan.end_episode_left_behind(pose)
+        episode = self._plan.episode
+        turned = episode is not None and episode.sweep_rad > 0.0
+        self._evidence.blocked = episode.blocked_rad if episode is not None and turned else ()
 
     def _watch_progress(self, pose: Pose, wish: Wish, why: str, now_ns: int) -> None:
         """Give up, once, where the vehicle has got nowhere for ``give_up_s`` although the planner wants to."""

@@ -35,11 +35,15 @@ from companion.guidance.situation import Evidence, Situation
 
 LOOK_AGAIN = "way blocked, looking again"
 """One answer says that no way is open: no step is made, and the vote of the next answers decides."""
+GAP_SEEN = "gap seen"
 NO_WAY_OUT = "no way out"
 TURNS_ALONG = "the goal turns with the vehicle"
 """A direction in the body frame that is out of view: turning toward it does not bring it into view."""
+_GAP_VIEW_DEG = 75.0
+"""A goal further off the axis than this is looked at before a gap is flown to."""
 _MEASURED_FREE_FACTOR = 0.7
 """In FOLLOW this share of a step measured free is enough to stay: the step is shortened to it anyway."""
+_SHORT_STEP_M = 0.5
 _REASON_KEPT_NS = 2_000_000_000
 """While nothing but the reason of HOLD changes, it is announced at most this often."""
 
@@ -124,8 +128,12 @@ class Table:
         in_view = s.off_axis_rad <= math.radians(self._config.view_deg)
         episode = self._plan.episode
         blocked_before = episode is not None and episode.is_blocked(s.bearing_rad)
+        if s.gap is not None and (s.off_axis_rad <= math.radians(_GAP_VIEW_DEG) or blocked_before):
+            return State.STEER, GAP_SEEN
         if s.wall is not None:
             return State.TURN, s.wall
+        if in_view and self._is_measured_free(s):
+            return State.FOLLOW, "way measured free"
         if s.answer is None:
             if in_view or blocked_before:
                 return State.HOLD, s.no_answer
@@ -133,11 +141,8 @@ class Table:
         if not in_view and not blocked_before:
             return self._look_there(s)
         evidence = self._evidence
-        if in_view and evidence.is_open(s.free_bearing_m, s.goal_m):
-            if self._is_measured_free(s):
-                return State.FOLLOW, "way measured free"
-            if self._agrees(s):
-                return State.FOLLOW, "void agrees"
+        if in_view and evidence.is_open(s.free_bearing_m, s.goal_m) and self._agrees(s):
+            return State.FOLLOW, "void agrees"
         void_is_open = evidence.is_open(evidence.void_free_m(s.answer, s), math.inf)
         if void_is_open and not (in_view and self._agrees(s)):
             return State.STEER, "void elsewhere"
@@ -162,6 +167,10 @@ class Table:
     def _is_measured_free(self, s: Situation) -> bool:
         """Whether the whole next step toward the goal is known to be free."""
         step_m = min(s.goal_m, self._config.max_step_m)
+        if s.answer is None:  # ranges without a direction: a short step is as good as what is known
+            if not self._evidence.sees_ranges():
+                return False
+            step_m = min(step_m, _SHORT_STEP_M)
         if self._standing.state is State.FOLLOW:
             step_m *= _MEASURED_FREE_FACTOR
         return (
@@ -205,6 +214,8 @@ class Table:
     def _from_turn(self, s: Situation) -> Change | None:
         if s.reached:
             return State.FOLLOW, "at the goal"
+        if s.gap is not None:
+            return State.STEER, GAP_SEEN
         plan = self._plan
         episode = plan.episode
         if episode is None:  # ended by a new goal while turning
@@ -212,7 +223,7 @@ class Table:
             if state is not State.TURN:
                 return state, reason
             episode = plan.begin_or_keep_episode(s.pose)
-            plan.begin_turn(s.pose)
+            plan.begin_turn(s.pose, s.now_ns)
         if episode.sweep_rad >= math.tau - 1e-6:
             return State.HOLD, NO_WAY_OUT
         step_s = self._config.turn_step_deg / self._config.yaw_rate_deg_s
@@ -229,7 +240,9 @@ class Table:
             return State.TURN, "nothing to probe"
         if s.wall is not None:
             return State.TURN, s.wall
-        if s.answer is not None:  # newer than the probe's beginning, see Plan.begin_probe()
+        if (
+            s.answer is not None or s.gap is not None
+        ):  # an answer newer than the probe, see Plan.begin_probe()
             state, reason = self.choose(s)
             if state is not State.HOLD:
                 return state, reason

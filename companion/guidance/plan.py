@@ -12,6 +12,8 @@ from companion.guidance.situation import Evidence
 
 TURN_DONE_RAD = math.radians(5.0)
 """A turn that is this close to its end is done."""
+_OPEN_M = 2.0
+"""A side counts as freer only for a way that leads at least this far."""
 _CLEARLY_M = 0.7
 """A side is freer than the other where it leads this much further."""
 _DEAD_AHEAD_RAD = math.radians(5.0)
@@ -157,7 +159,7 @@ class Plan:
         """Return the side on which a way is measured to lead clearly further, 0 where there is none."""
         evidence = self._evidence
         furthest = {-1: 0.0, 1: 0.0}
-        for azimuth, free_m in evidence.seen.free_azimuths(0.0, pose, evidence.speed_m_s, now_ns):
+        for azimuth, free_m in evidence.seen.free_azimuths(_OPEN_M, pose, evidence.speed_m_s, now_ns):
             off_rad = wrap_rad(azimuth - look_rad)
             side = 1 if off_rad > 0 else -1
             if abs(off_rad) <= math.pi / 2:

@@ -31,7 +31,7 @@ from enum import StrEnum
 from companion.config import GuidanceConfig
 from companion.guidance.coordinates import wrap_rad
 from companion.guidance.plan import TURN_DONE_RAD, Plan
-from companion.guidance.situation import Evidence, Situation
+from companion.guidance.situation import Answer, Evidence, Situation
 
 LOOK_AGAIN = "way blocked, looking again"
 """One answer says that no way is open: no step is made, and the vote of the next answers decides."""
@@ -44,6 +44,7 @@ _GAP_VIEW_DEG = 75.0
 _MEASURED_FREE_FACTOR = 0.7
 """In FOLLOW this share of a step measured free is enough to stay: the step is shortened to it anyway."""
 _SHORT_STEP_M = 0.5
+_NEAR_M = 2.0
 _REASON_KEPT_NS = 2_000_000_000
 """While nothing but the reason of HOLD changes, it is announced at most this often."""
 
@@ -138,7 +139,7 @@ class Table:
             if in_view or blocked_before:
                 return State.HOLD, s.no_answer
             return self._look_there(s)
-        if not in_view and not blocked_before:
+        if not in_view and not blocked_before and not self._goes_on_better(s, s.answer):
             return self._look_there(s)
         evidence = self._evidence
         if in_view and evidence.is_open(s.free_bearing_m, s.goal_m) and self._agrees(s):
@@ -152,6 +153,11 @@ class Table:
         if self._plan.turns_along(s.wish.body_bearing_rad):
             return State.HOLD, TURNS_ALONG
         return State.ALIGN, "goal out of view"
+
+    def _goes_on_better(self, s: Situation, answer: Answer) -> bool:
+        """Whether something is remembered near the goal's bearing, and the void leads further: no need to look there."""
+        void_m = self._evidence.void_free_m(answer, s)
+        return s.free_bearing_m is not None and void_m is not None and s.free_bearing_m < _NEAR_M <= void_m
 
     def _agrees(self, s: Situation) -> bool:
         """Whether the void lies at the goal's bearing, or a plane that fills the view is far enough."""

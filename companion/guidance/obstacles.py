@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from companion.guidance.coordinates import wrap_rad
 from companion.guidance.observation import DetectionReport, Pose
 
 _CELL_M = 0.2
 _SIGHTINGS = 2
 """Reports that must have seen a cell: one alone may have followed a wrong point."""
+_MOST_SIGHTINGS = 4
+"""More are not counted: what was seen wrongly for a while can be seen to be free again."""
+_THROUGH_RAD = math.radians(2.0)
+_BEYOND_M = 0.4
 _FORGET_M = 5.0
 _FORGET_NS = 60_000_000_000
 _CLOSING = 0.9
@@ -52,12 +57,21 @@ class NearObstacles:
         self._cells.clear()
 
     def add(self, report: DetectionReport) -> None:
-        """Take what one report saw nearby."""
+        """Take what one report saw nearby; a cell in the middle of a way that it measured free loses a sighting."""
+        seen: set[tuple[int, int]] = set()
         for north_m, east_m in report.obstacles:
             key = (math.floor(north_m / _CELL_M), math.floor(east_m / _CELL_M))
+            seen.add(key)
             cell = self._cells.get(key)
-            sightings = 1 if cell is None else cell.sightings + 1
+            sightings = 1 if cell is None else min(cell.sightings + 1, _MOST_SIGHTINGS)
             self._cells[key] = _Cell(north_m, east_m, sightings, report.frame_ns)
+        if report.pose is None:
+            return
+        for key, cell in list(self._cells.items()):
+            if key not in seen and _sees_through(report, report.pose, cell):
+                cell.sightings -= 1
+                if cell.sightings <= 0:
+                    del self._cells[key]
 
     def free_m(self, azimuth_rad: float, pose: Pose, now_ns: int) -> float | None:
         """Return how far the vehicle can go along an azimuth before it meets a remembered obstacle.
@@ -138,3 +152,14 @@ class NearObstacles:
             if now_ns - cell.seen_ns <= _FORGET_NS
             and math.dist(here, (cell.north_m, cell.east_m)) <= _FORGET_M
         }
+
+
+def _sees_through(report: DetectionReport, pose: Pose, cell: _Cell) -> bool:
+    """Whether a report measured the way free to clearly beyond a cell."""
+    north_m, east_m = cell.north_m - pose.north_m, cell.east_m - pose.east_m
+    distance_m, azimuth = math.hypot(north_m, east_m), math.atan2(east_m, north_m)
+    return any(
+        abs(wrap_rad(bearing.azimuth_rad - azimuth)) <= _THROUGH_RAD
+        and bearing.distance_m - bearing.spread_m >= distance_m + _BEYOND_M
+        for bearing in report.bearings
+    )

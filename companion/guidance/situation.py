@@ -245,6 +245,11 @@ class Evidence:
         last = self.last_report
         return last is not None and last.kind == "none" and last.reason not in _NO_PARALLAX
 
+    def lacks_parallax(self) -> bool:
+        """Whether the last picture said nothing for want of motion."""
+        last = self.last_report
+        return last is not None and last.kind == "none" and last.reason in _NO_PARALLAX
+
     def sees_ranges(self) -> bool:
         """Whether the last pictures told distances: without, what was measured before is not gone by for long."""
         return self._blind_reports < self._config.bad_reports_to_hold

@@ -189,7 +189,7 @@ class Table:
 
     def _from_follow(self, s: Situation) -> Change | None:
         state, reason = self.choose(s)
-        return None if state is State.FOLLOW or reason == LOOK_AGAIN else (state, reason)
+        return None if state is State.FOLLOW or self._looks_again(s, reason) else (state, reason)
 
     def _from_align(self, s: Situation) -> Change | None:
         if s.reached:
@@ -215,7 +215,12 @@ class Table:
             evidence = self._evidence
             goes_on = evidence.is_open(evidence.void_free_m(s.answer, s), math.inf)
             return None if goes_on else (state, reason)
-        return None if state is State.STEER or reason == LOOK_AGAIN else (state, reason)
+        return None if state is State.STEER or self._looks_again(s, reason) else (state, reason)
+
+    def _looks_again(self, s: Situation, reason: str) -> bool:
+        """Whether to wait where it is for the vote of the next answers: at rest none come without parallax."""
+        at_rest = s.speed_m_s <= self._config.moving_m_s and self._evidence.lacks_parallax()
+        return reason == LOOK_AGAIN and not at_rest
 
     def _from_turn(self, s: Situation) -> Change | None:
         if s.reached:

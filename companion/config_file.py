@@ -29,7 +29,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 def load_config(path: str | Path) -> Config:
     """Read a configuration file.
 
-    Relative paths in it (``source.path``, ``camera.file``, ``detector.params_file``, ``link.signing_key_file``) are taken as relative
+    Relative paths in it (``source.url`` of a file, ``camera.file``, ``detector.params_file``, ``link.signing_key_file``) are taken as relative
     to the file's own folder.
 
     Parameters
@@ -129,7 +129,9 @@ def _resolve_paths(config: Config, folder: Path) -> Config:
     def resolved(value: str) -> str:
         return str(folder / value) if value else value
 
-    source: SourceConfig = config.source.model_copy(update={"path": resolved(config.source.path)})
+    source: SourceConfig = config.source
+    if source.scheme == "file":
+        source = source.model_copy(update={"url": f"file:{resolved(source.where)}"})
     camera: CameraConfig = config.camera.model_copy(update={"file": resolved(config.camera.file)})
     detector: DetectorConfig = config.detector.model_copy(
         update={"params_file": resolved(config.detector.params_file)}

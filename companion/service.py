@@ -132,7 +132,7 @@ class Service:
                 "service_started",
                 planner=_listening(planner),
                 autopilot=_listening(autopilot),
-                source=config.source.path or config.source.address,
+                source=config.source.url,
                 preset=config.detector.preset,
             )
             try:
@@ -164,8 +164,8 @@ class Service:
             try:
                 source = self._open_frames()
                 async with source:
-                    log.info("source_opened", kind=config.kind)
-                    if config.kind == "file":
+                    log.info("source_opened", kind=config.scheme)
+                    if config.scheme == "file":
                         await vision.wait_ready()  # so that nothing of a recording is lost
                     async for frame in source.frames():
                         now_ns = clock.now_ns()
@@ -177,11 +177,11 @@ class Service:
                         vision.offer(frame, flight.pose_of(frame, now_ns))
                 self._source_fault = "frame source has ended"
                 log.warning("source_ended")
-                if config.kind == "file":
+                if config.scheme == "file":
                     return
             except SourceError as error:
-                if self._last_frame_ns is None and config.kind == "file":
-                    raise  # a file that cannot be read will not come back
+                if self._last_frame_ns is None:
+                    raise  # a file that is not there, or what is not installed; cameras come back by themselves
                 self._source_fault = "frame source failed"
                 log.warning("source_failed", error=str(error))
             delay_s = _REOPEN_DELAYS_S[min(failures, len(_REOPEN_DELAYS_S) - 1)]

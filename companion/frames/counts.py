@@ -22,7 +22,11 @@ class FrameCounts:
     time_refused
         Exposure times in the future, too far in the past, or not after the one before.
     reconnects
-        Times that a connection was made again.
+        Times that a connection was made, or a camera opened, again.
+    repeated
+        Pictures that were the one before again, bit for bit.
+    lost_by_driver
+        Frames that a camera's driver dropped because nobody fetched them in time.
     """
 
     delivered: int = 0
@@ -31,3 +35,5 @@ class FrameCounts:
     wrong_size: int = 0
     time_refused: int = 0
     reconnects: int = 0
+    repeated: int = 0
+    lost_by_driver: int = 0

@@ -22,11 +22,10 @@ class NewestMailbox(Generic[T]):
         self._item: T | None = None
         self._filled = asyncio.Event()
 
-    def put(self, item: T) -> bool:
-        """Leave an item; return whether it replaced one that nobody took. Never blocks."""
+    def put(self, item: T) -> T | None:
+        """Leave an item; return the one that it replaced because nobody took it. Never blocks."""
         with self._lock:
-            replaced = self._item is not None
-            self._item = item
+            replaced, self._item = self._item, item
         with contextlib.suppress(RuntimeError):  # the loop has ended: nobody will take anything any more
             self._loop.call_soon_threadsafe(self._filled.set)
         return replaced

@@ -201,7 +201,7 @@ class _Receiver:
                                 width_px=frame.image.shape[1],
                                 height_px=frame.image.shape[0],
                             )
-                        self._counts.skipped_late += self._mailbox.put(frame)
+                        self._counts.skipped_late += self._mailbox.put(frame) is not None
                     reason = "closed by the sender"
             except (OSError, FrameStreamError) as error:
                 reason = str(error) or type(error).__name__

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +18,19 @@ class Frame:
     Attributes
     ----------
     image
-        (H, W) uint8.
+        (H, W) uint8. It is good until the next frame is asked for: a camera may fill its memory again then.
     time_ns
-        Our monotonic time of the exposure.
+        Our monotonic time of the exposure, or of the arrival where ``time_of`` says so.
     seq
         Number of the frame, from 0, counting those dropped before they got here.
+    time_of
+        What ``time_ns`` is the time of: not every camera tells when it exposed.
     """
 
     image: NDArray[np.uint8]
     time_ns: int
     seq: int
+    time_of: Literal["exposure", "arrival"] = "exposure"
 
 
 class FrameSource(Protocol):

@@ -172,7 +172,7 @@ async def _footage(output: Path, display: Display) -> Part:
     display.begin("1 of 2: real footage, recorded poses")
     service = CompanionProcess(
         {
-            "source": {"kind": "file", "path": str(OFFICE_WALK)},
+            "source": {"url": f"file:{OFFICE_WALK}"},
             "camera": {"file": str(OFFICE_WALK_CAMERA)},
             "log": {"status_interval_s": _STATUS_S, "detections": True},
         },
@@ -220,7 +220,7 @@ async def _room(output: Path, display: Display) -> Part:
         feed = await stack.enter_async_context(CameraFeed(DEMO_ROOM, camera, autopilot.true_pose))
         service = CompanionProcess(
             {
-                "source": {"kind": "socket", "address": "{}:{}".format(*feed.address)},
+                "source": {"url": "tcp:{}:{}".format(*feed.address)},
                 "camera": {"hfov_deg": _ROOM_HFOV_DEG},
                 "link": {"autopilot": "udpout:{}:{}".format(*autopilot.address)},
                 "log": {"status_interval_s": _STATUS_S, "detections": True},

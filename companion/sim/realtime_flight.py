@@ -96,7 +96,7 @@ async def _started_service(
         )
     )
     tables = service_tables(spec, autopilot.address)
-    tables["source"]["address"] = "{}:{}".format(*feed.address)
+    tables["source"]["url"] = "tcp:{}:{}".format(*feed.address)
 
     def on_event(event: Event) -> None:
         recorder.on_event(event, time.monotonic_ns())

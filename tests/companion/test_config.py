@@ -62,9 +62,46 @@ def test_an_integer_does_for_a_float():
             "guidance.wall_k: found 2.0; allowed: whole number from 1 and up to 20",
         ),
         ("[source]\nloop = 1", "source.loop: found 1; allowed: true or false"),
-        ("[source]\npath = 3", "source.path: found 3; allowed: text"),
-        ("[source]\npath = []", "source.path: found a list; allowed: text"),
-        ('[source]\nkind = "v4l2"', 'source.kind: found "v4l2"; allowed: one of "file", "socket"'),
+        (
+            "[source]\nurl = 3",
+            'source.url: found 3; allowed: text such as "v4l2:/dev/video0" or "file:walk.mp4"',
+        ),
+        (
+            "[source]\ncontrols = []",
+            'source.controls: found a list; allowed: text such as "auto_exposure=manual_mode, exposure_time_absolute=80"',
+        ),
+        (
+            '[source]\npixel_format = "H264"',
+            'source.pixel_format: found "H264"; allowed: one of "auto", "GREY", "YUYV", "UYVY", "NV12", "MJPEG"',
+        ),
+        (
+            '[source]\nurl = "walk.mp4"',
+            (
+                'source.url: found "walk.mp4"; allowed: SCHEME:WHERE with one of the schemes '
+                "v4l2, picamera2, rtsp, rtsps, udp, gst, file, tcp"
+            ),
+        ),
+        (
+            '[source]\nurl = "v4l2:video0"',
+            'source.url: found "v4l2:video0"; allowed: v4l2:PATH with the whole path of a device, such as v4l2:/dev/video0',
+        ),
+        (
+            '[source]\nurl = "picamera2:"',
+            'source.url: found "picamera2:"; allowed: picamera2:NUMBER, 0 for the first camera',
+        ),
+        (
+            '[source]\nurl = "rtsp:cam"',
+            'source.url: found "rtsp:cam"; allowed: rtsp://HOST:PORT and what follows',
+        ),
+        ('[source]\nurl = "gst:"', 'source.url: found "gst:"; allowed: something after gst:'),
+        (
+            '[source]\ncontrols = "gain 3"',
+            'source.controls: found "gain 3"; allowed: NAME=VALUE, NAME=VALUE with names as `companion cameras` lists them',
+        ),
+        (
+            "[source]\nwidth_px = 640",
+            "source.height_px: found 0; allowed: both sizes or neither: width_px is set",
+        ),
         (
             "[guidance]\nvelocity_horizon_s = 0.2",
             "guidance.velocity_horizon_s: found 0.2; allowed: 0 (the autopilot's own), or from 0.5 to 10",
@@ -85,8 +122,8 @@ def test_an_integer_does_for_a_float():
             'link.planner: found "udpout:h:0"; allowed: a port from 1 to 65535',
         ),
         (
-            '[source]\naddress = "here"',
-            'source.address: found "here"; allowed: HOST:PORT with a port from 1 to 65535',
+            '[source]\nurl = "tcp:here"',
+            'source.url: found "tcp:here"; allowed: tcp:HOST:PORT with a port from 1 to 65535',
         ),
         ("camera = 5", "camera: found 5; allowed: a table, [camera]"),
         ("[camera]\nhfov = 70", "camera.hfov: unknown key; did you mean camera.hfov_deg?"),
@@ -156,7 +193,7 @@ def test_the_models_refuse_disagreeing_keys_wherever_they_are_made():
     with pytest.raises(ValidationError, match="restart_delay_s"):
         DetectorConfig(restart_delay_s=2.0, restart_delay_max_s=1.0)
     with pytest.raises(ValidationError, match="HOST:PORT"):
-        SourceConfig(address="h:66000")
+        SourceConfig(url="tcp:h:66000")
 
 
 def test_two_ephemeral_ports_are_not_the_same_endpoint():
@@ -180,7 +217,7 @@ def test_what_is_not_toml_is_said_with_its_place(text: str, words: str):
 
 
 def test_a_long_value_is_cut_in_the_message():
-    (line,) = fault_lines(f'[source]\nkind = "{"x" * 10_000}"')
+    (line,) = fault_lines(f'[source]\npixel_format = "{"x" * 10_000}"')
     assert len(line) < 200
 
 
@@ -217,11 +254,11 @@ def test_a_byte_order_mark_is_no_fault(tmp_path: Path):
 def test_relative_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "etc").mkdir()
     (tmp_path / "etc" / "f.toml").write_text(
-        "[source]\npath = 'walk'\n[camera]\nfile = '../cam.toml'\n[detector]\nparams_file = '/abs/p.toml'\n"
+        "[source]\nurl = 'file:walk'\n[camera]\nfile = '../cam.toml'\n[detector]\nparams_file = '/abs/p.toml'\n"
     )
     monkeypatch.chdir(tmp_path)
     config = load_config("etc/f.toml")
-    assert config.source.path == str(tmp_path / "etc" / "walk")
+    assert config.source.url == f"file:{tmp_path}/etc/walk"
     assert Path(config.camera.file).resolve() == tmp_path / "cam.toml"
     assert config.detector.params_file == "/abs/p.toml"
 

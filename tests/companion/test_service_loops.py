@@ -152,7 +152,7 @@ async def test_a_report_that_cannot_be_taken_is_logged_once_and_ends_nothing():
 async def test_a_recording_that_has_ended_is_a_fault_that_stays(tmp_path):
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((24, 32), 40 * i, np.uint8))
-    config = Config(source=SourceConfig(path=str(tmp_path), playback="fastest"))
+    config = Config(source=SourceConfig(url=f"file:{tmp_path}", playback="fastest"))
     service, flight, vision, log, _ = parts(RealClock(), config)
     vision._was_ready.set()
     await asyncio.wait_for(service._frames(flight, vision), 10)
@@ -162,7 +162,7 @@ async def test_a_recording_that_has_ended_is_a_fault_that_stays(tmp_path):
 
 
 async def test_a_recording_that_is_not_there_ends_the_start_with_its_name(tmp_path):
-    config = Config(link=LINKS, source=SourceConfig(path=str(tmp_path / "absent.mp4")))
+    config = Config(link=LINKS, source=SourceConfig(url=f"file:{tmp_path}/absent.mp4"))
     service = Service(config, clock=RealClock(), log=capturing_log()[0])
     with pytest.raises(ExceptionGroup) as caught:
         await asyncio.wait_for(service.run(), 20)
@@ -175,7 +175,7 @@ async def test_a_stop_ends_it_within_two_seconds_also_while_source_and_worker_st
         silent.bind(("127.0.0.1", 0))
         silent.listen()
         address = f"127.0.0.1:{silent.getsockname()[1]}"
-        config = Config(link=LINKS, source=SourceConfig(kind="socket", address=address))
+        config = Config(link=LINKS, source=SourceConfig(url=f"tcp:{address}"))
         service = Service(config, clock=RealClock(), log=capturing_log()[0])
         running = asyncio.create_task(service.run())
         await asyncio.sleep(after_s)
@@ -190,7 +190,7 @@ async def test_a_sender_that_is_silent_until_the_end_is_announced_with_its_name(
         silent.bind(("127.0.0.1", 0))
         silent.listen()
         address = f"127.0.0.1:{silent.getsockname()[1]}"
-        config = Config(link=LINKS, source=SourceConfig(kind="socket", address=address, timeout_s=0.05))
+        config = Config(link=LINKS, source=SourceConfig(url=f"tcp:{address}", timeout_s=0.05))
         log, captured = capturing_log()
         service = Service(config, clock=RealClock(), log=log)
         running = asyncio.create_task(service.run())

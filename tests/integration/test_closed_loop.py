@@ -40,7 +40,7 @@ class World:
         self.service = await enter(
             CompanionProcess(
                 {
-                    "source": {"kind": "socket", "address": "{}:{}".format(*feed.address)},
+                    "source": {"url": "tcp:{}:{}".format(*feed.address)},
                     "camera": {"hfov_deg": HFOV_DEG},
                     "guidance": self.guidance,
                     "link": {"autopilot": "udpout:{}:{}".format(*self.autopilot.address)},

@@ -146,7 +146,7 @@ async def test_ten_thousand_messages_each_way_while_the_worker_is_killed_ten_tim
     async with noise_camera() as camera:
         service = CompanionProcess(
             {
-                "source": {"kind": "socket", "address": camera},
+                "source": {"url": f"tcp:{camera}"},
                 "detector": {"restart_delay_s": 0.05, "restart_delay_max_s": 0.2},
                 "guidance": {"give_up_s": 3600.0},
                 **QUIET,
@@ -221,7 +221,7 @@ async def test_detection_resumes_by_itself_after_the_worker_was_killed():
     async with noise_camera() as camera:
         service = CompanionProcess(
             {
-                "source": {"kind": "socket", "address": camera},
+                "source": {"url": f"tcp:{camera}"},
                 "log": {"status_interval_s": 0.5, "detections": True},
             }
         )
@@ -236,7 +236,7 @@ async def test_detection_resumes_by_itself_after_the_worker_was_killed():
 
 
 async def test_garbage_on_either_port_is_counted_and_good_frames_go_on():
-    service = CompanionProcess({"source": {"kind": "socket", "address": "127.0.0.1:9"}, **QUIET})
+    service = CompanionProcess({"source": {"url": "tcp:127.0.0.1:9"}, **QUIET})
     async with service:
         started = await service.wait_for("service_started")
         async with (
@@ -268,7 +268,7 @@ async def test_garbage_on_either_port_is_counted_and_good_frames_go_on():
 
 
 async def test_a_nan_never_leaves_and_an_unhandled_kind_is_announced_once():
-    service = CompanionProcess({"source": {"kind": "socket", "address": "127.0.0.1:9"}, **QUIET})
+    service = CompanionProcess({"source": {"url": "tcp:127.0.0.1:9"}, **QUIET})
     async with service:
         started = await service.wait_for("service_started")
         async with (
@@ -308,7 +308,7 @@ async def test_a_nan_never_leaves_and_an_unhandled_kind_is_announced_once():
 
 async def test_sigterm_ends_it_within_two_seconds_and_leaves_no_process():
     async with noise_camera() as camera:
-        service = CompanionProcess({"source": {"kind": "socket", "address": camera}, **QUIET})
+        service = CompanionProcess({"source": {"url": f"tcp:{camera}"}, **QUIET})
         async with service:
             ready = await service.wait_for("worker_ready", 60)
             began = time.monotonic_ns()
@@ -325,7 +325,7 @@ async def test_sigkill_of_the_companion_leaves_the_autopilot_to_its_failsafe():
     ):
         service = CompanionProcess(
             {
-                "source": {"kind": "socket", "address": camera},
+                "source": {"url": f"tcp:{camera}"},
                 "link": {"autopilot": "udpout:{}:{}".format(*autopilot.address)},
                 **QUIET,
             }
@@ -383,13 +383,13 @@ def config_file(folder: Path, **source: object) -> Path:
 
 
 def test_a_missing_source_is_a_clear_error(tmp_path):
-    result = run_companion("run", "-c", str(config_file(tmp_path, path="nowhere.mp4")))
+    result = run_companion("run", "-c", str(config_file(tmp_path, url="file:nowhere.mp4")))
     assert_clear_error(result, "nowhere.mp4")
 
 
 def test_a_corrupt_video_is_a_clear_error(tmp_path):
     (tmp_path / "broken.mp4").write_bytes(b"\0\0\0\x20ftypisom" + bytes(500))
-    result = run_companion("run", "-c", str(config_file(tmp_path, path="broken.mp4")))
+    result = run_companion("run", "-c", str(config_file(tmp_path, url="file:broken.mp4")))
     assert_clear_error(result, "broken.mp4")
 
 
@@ -404,7 +404,7 @@ def test_a_wrong_key_a_missing_file_and_a_broken_camera_file_are_clear_errors(tm
     (tmp_path / "frames").mkdir()
     cv2.imwrite(str(tmp_path / "frames" / "0.png"), image)
     (tmp_path / "camera.toml").write_text("width_px = 'wide'\n")
-    path = config_file(tmp_path, path="frames", loop=True)
+    path = config_file(tmp_path, url="file:frames", loop=True)
     path.write_text(path.read_text() + '[camera]\nfile = "camera.toml"\n')
     assert_clear_error(run_companion("run", "-c", str(path)), "camera.toml", "width_px")
 
@@ -421,7 +421,7 @@ def test_a_port_in_use_is_a_clear_error(tmp_path):
 def test_a_signing_key_that_others_may_read_is_a_clear_error(tmp_path):
     (tmp_path / "signing.key").write_bytes(bytes(range(32)))
     (tmp_path / "signing.key").chmod(0o644)
-    path = config_file(tmp_path, kind="socket", address="127.0.0.1:9")
+    path = config_file(tmp_path, url="tcp:127.0.0.1:9")
     path.write_text(path.read_text().replace("[link]", '[link]\nsigning_key_file = "signing.key"'))
     assert_clear_error(run_companion("run", "-c", str(path)), str(tmp_path / "signing.key"), "chmod 600")
 
@@ -445,7 +445,7 @@ async def test_tiny_images_are_reported_not_crashed_on(tmp_path):
     for number in range(5):
         cv2.imwrite(str(folder / f"{number}.png"), np.full((1, 1), 90, np.uint8))
     service = CompanionProcess(
-        {"source": {"path": str(folder), "loop": True}, "log": {"status_interval_s": 0.5, "detections": True}}
+        {"source": {"url": f"file:{folder}", "loop": True}, "log": {"status_interval_s": 0.5, "detections": True}}
     )
     async with service:
         event = await service.wait_for("detection", 60)

@@ -181,14 +181,14 @@ async def test_images_that_go_away_under_a_loop_end_it(tmp_path: Path, log):
 
 async def test_opening_what_is_not_there_is_a_clear_error(tmp_path: Path, log):
     with pytest.raises(SourceError, match="no such file"):
-        async with open_source(SourceConfig(path=str(tmp_path / "gone.mp4")), clock=RealClock(), log=log):
+        async with open_source(SourceConfig(url=f"file:{tmp_path}/gone.mp4"), clock=RealClock(), log=log):
             pass
-    with pytest.raises(SourceError, match=r"source\.path is empty"):
+    with pytest.raises(SourceError, match=r"source\.url is empty"):
         open_source(SourceConfig(), clock=RealClock(), log=log)
 
 
 async def test_the_configuration_chooses_how_it_plays(tmp_path: Path, log):
-    config = SourceConfig(path=str(folder_of(tmp_path, 3)), playback="fastest", fps=1)
+    config = SourceConfig(url=f"file:{folder_of(tmp_path, 3)}", playback="fastest", fps=1)
     async with open_source(config, clock=RealClock(), log=log) as source:
         assert [frame.seq async for frame in source.frames()] == [0, 1, 2]
 

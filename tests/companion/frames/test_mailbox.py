@@ -6,12 +6,12 @@ from companion.frames.mailbox import NewestMailbox
 
 async def test_the_newest_item_is_taken_and_the_replaced_ones_are_told():
     mailbox: NewestMailbox[int] = NewestMailbox()
-    replaced: list[bool] = []
+    replaced: list[int | None] = []
     thread = threading.Thread(target=lambda: replaced.extend(mailbox.put(i) for i in range(5)))
     thread.start()
     thread.join()
     assert await mailbox.get() == 4
-    assert replaced == [False, True, True, True, True]
+    assert replaced == [None, 0, 1, 2, 3]
 
 
 async def test_an_item_is_taken_once():
@@ -30,4 +30,4 @@ def test_leaving_an_item_after_the_event_loop_has_ended_is_harmless():
         return NewestMailbox()
 
     mailbox = asyncio.run(make())
-    assert mailbox.put(1) is False
+    assert mailbox.put(1) is None

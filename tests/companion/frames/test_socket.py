@@ -216,7 +216,7 @@ async def test_the_configuration_names_the_address(events):
         await reader.read()
 
     async with sender(talk) as port:
-        config = SourceConfig(kind="socket", address=f"127.0.0.1:{port}")
+        config = SourceConfig(url=f"tcp:127.0.0.1:{port}")
         async with open_source(config, clock=RealClock(), log=events[0]) as source:
             assert (await anext(source.frames())).seq == 4
 

@@ -95,7 +95,7 @@ def grid_tracks(
         np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         for image in (earlier, later)
     )
-    turned, seen = _turned(before, small, later_from_earlier)
+    turned, seen = turned_picture(before, small, later_from_earlier)
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     back = np.asarray(search.calc(now, turned, None), np.float32)  # type: ignore[call-overload]  # no start is allowed
     forth = np.asarray(search.calc(turned, now, None), np.float32)  # type: ignore[call-overload]
@@ -125,7 +125,7 @@ def grid_tracks(
     return tracks, params.sigma_px * to_full
 
 
-def _turned(
+def turned_picture(
     image: NDArray[np.uint8], camera: CameraModel, later_from_earlier: NDArray[np.float64]
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the earlier picture as the later camera's orientation would have seen it, and where it saw anything (255)."""

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from detector.camera_model import CameraModel
 from detector.results import TimeToContact
+from detector.rotation import rotation_matrix, rotation_vector
 
 FLOW_SIGMA_PX: Final = 0.3
 """Standard deviation of one track's flow on each axis, as measured for Lucas-Kanade on sharp frames."""
@@ -383,12 +384,12 @@ def refine_rotation(
         # Turning the start by w moves it by w x a; seen across the line that is w . (a x plane), and the end should follow it.
         jacobian = -np.cross(turned_good, plane)
         weight = 1.0 / (1.0 + (residual / (2.0 * sigma)) ** 2) / sigma**2
-        already = _rotation_vector(rotation)
+        already = rotation_vector(rotation)
         step = np.linalg.solve(
             jacobian.T @ (jacobian * weight[:, None]) + np.eye(3) / prior_sigma_rad**2,
             -(jacobian.T @ (weight * residual)) - already / prior_sigma_rad**2,
         )
-        rotation = _rotation(step) @ rotation
+        rotation = rotation_matrix(step) @ rotation
         if float(np.linalg.norm(step)) < 1e-6:
             break
     return rotation
@@ -601,28 +602,6 @@ def _weighted_quantile(values: NDArray[np.float64], weights: NDArray[np.float64]
     cumulative = np.cumsum(weights[order])
     position = (cumulative - 0.5 * weights[order]) / cumulative[-1]
     return float(np.interp(share, position, values[order]))
-
-
-def _rotation(vector_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation of a rotation vector (Rodrigues)."""
-    angle = float(np.linalg.norm(vector_rad))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector_rad / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rotation: NDArray[np.float64] = (
-        np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
-    )
-    return rotation
-
-
-def _rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation vector of a small rotation (well below a half turn)."""
-    twice_sine_axis = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    sine = 0.5 * float(np.linalg.norm(twice_sine_axis))
-    return np.asarray(0.5 * twice_sine_axis * (math.asin(min(sine, 1.0)) / sine if sine > 1e-9 else 1.0))
 
 
 def _tracks(start_px: ArrayLike, end_px: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

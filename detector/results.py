@@ -1,5 +1,7 @@
 """What a detection can be: a direction, a single plane, or no detection with its reason.
 
+Both methods answer with these. What only one of them knows (confidence, uncertainty of the focus of expansion) is None for the other.
+
 A failed estimate is a value with a reason, never None and never an exception.
 """
 
@@ -10,12 +12,14 @@ from enum import StrEnum
 
 
 class DirectionKind(StrEnum):
-    """Where a direction came from (paper section 2.4)."""
+    """Where a direction came from: of the paper's method (section 2.4), or a gap of the void map."""
 
     VANISHING_POINT = "vanishing_point"
     """The vanishing-point candidate nearest to the LMCC was elected."""
     LOWEST_FLOW = "lowest_flow"
     """No candidate was elected: the lowest-magnitude cluster centre itself (LMCC)."""
+    GAP = "gap"
+    """A gap of the void map that the vehicle fits through (method ``parallax``)."""
 
 
 class NoDetectionReason(StrEnum):
@@ -27,6 +31,10 @@ class NoDetectionReason(StrEnum):
     """Fewer SIFT key points than the limit in the second frame."""
     TOO_LITTLE_FLOW = "too_little_flow"
     """Too few optical flow vectors left by the filters of section 2.2."""
+    TOO_LITTLE_TEXTURE = "too_little_texture"
+    """Too few places in the picture whose flow could be measured (method ``parallax``)."""
+    NOTHING_KNOWN = "nothing_known"
+    """There was flow, but in no direction enough of it to say how far the way is free (method ``parallax``)."""
     NO_MOTION = "no_motion"
     """The camera did not move far enough for parallax. Never a wall, and not a failure."""
     BLURRED = "blurred"
@@ -60,6 +68,45 @@ class TimeToContact:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionEstimate:
+    """How the camera moved between the two frames, as far as the method found it out (method ``parallax``).
+
+    Attributes
+    ----------
+    rotation_source
+        ``attitude`` (given, not refined), ``attitude_refined`` or ``flow``.
+    intrinsics_source
+        ``calibration``, ``field_of_view``, ``estimated`` or ``assumed``.
+    direction_later
+        Unit vector from the earlier to the later position, in the later camera's axes.
+    direction_sigma_deg, rotation_sigma_deg
+        Standard deviations, of the less certain axis.
+    focus_px, focus_sigma_px
+        Focus of expansion in the later frame without distortion; None where the camera did not move forwards.
+    samples, informative
+        Samples of the flow, and those that say something of their range.
+    plane_preferred, plane_share, plane_normal_later
+        Whether one plane explains the flow better than a scene with depth, the share of samples that it explains, and its unit normal.
+    parallax_rad
+        Flow that the best rotation leaves, 80th percentile.
+    """
+
+    rotation_source: str
+    intrinsics_source: str
+    direction_later: tuple[float, float, float]
+    direction_sigma_deg: float
+    rotation_sigma_deg: float
+    focus_px: tuple[float, float] | None
+    focus_sigma_px: float | None
+    samples: int
+    informative: int
+    plane_preferred: bool
+    plane_share: float
+    plane_normal_later: tuple[float, float, float] | None
+    parallax_rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class Diagnostics:
     """How an answer came about. Points are (x, y) in px of the second frame's full size.
 
@@ -85,6 +132,8 @@ class Diagnostics:
         What the single-plane test compared (px in the literal test, a ratio in the scale-free one).
     focus_of_expansion_px
         From the pose's translation or the derotated flow, where it is known.
+    motion
+        Of the parallax method.
     seconds
         Wall time of each step.
     """
@@ -109,26 +158,32 @@ class Diagnostics:
     plane_threshold: float | None = None
     median_flow_px: float | None = None
     focus_of_expansion_px: tuple[float, float] | None = None
+    motion: MotionEstimate | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """The furthest empty plane lies at (x_px, y_px) of the second frame: (x_d, y_d) of the paper."""
+    """The furthest empty plane lies at (x_px, y_px) of the second frame: (x_d, y_d) of the paper.
+
+    ``confidence`` in [0, 1] is how often answers like it are right; None from a method that does not say.
+    """
 
     x_px: float
     y_px: float
     kind: DirectionKind
     time_to_contact: TimeToContact | None
     diagnostics: Diagnostics
+    confidence: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SinglePlane:
-    """One plane (a wall) fills the view: turn about z (paper section 2.2)."""
+    """One plane (a wall) fills the view: turn about z (paper section 2.2). ``confidence`` as of a :class:`Direction`."""
 
     time_to_contact: TimeToContact | None
     diagnostics: Diagnostics
+    confidence: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

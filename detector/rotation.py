@@ -5,6 +5,7 @@ A turning camera sees no parallax: its flow says nothing of depth, however large
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -66,3 +67,25 @@ def parallax_px(cameras: Sequence[Camera], tracks: Tracks, *, percentile: float 
         float(np.percentile(left[np.isfinite(left)], percentile)) if np.isfinite(left).any() else 0.0
         for left in left_px
     )
+
+
+def rotation_matrix(vector_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (3, 3) rotation of a rotation vector (3,), in rad (Rodrigues)."""
+    angle = float(np.linalg.norm(vector_rad))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector_rad / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: NDArray[np.float64] = (
+        np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    )
+    return rotation
+
+
+def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation vector (3,), in rad, of a small rotation (3, 3), below a quarter turn."""
+    twice_sine_axis = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine = 0.5 * float(np.linalg.norm(twice_sine_axis))
+    return np.asarray(0.5 * twice_sine_axis * (math.asin(min(sine, 1.0)) / sine if sine > 1e-9 else 1.0))

@@ -1,0 +1,258 @@
+"""Flow on a grid of the later frame, each sample with the information that the picture holds about it.
+
+The earlier frame is first turned into the later camera's orientation, as far as that is known. Dense inverse search (Kroeger et al. 2016)
+both ways gives the flow, a Lucas-Kanade step its last tenths of a pixel. What the picture fixes is told by the structure tensor: its inverse
+is the covariance of the flow, small across an edge and large along it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from detector.camera_model import CameraModel
+from detector.dense_flow import turned_picture
+from detector.parallax.params import ParallaxParams
+from detector.rotation import fit_rotation, rotation_matrix
+
+_LK_WINDOW_PX: Final = 11
+_LK_CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 6, 0.02)
+_LK_MOST_PX: Final = 1.5
+"""Lucas-Kanade refines; where it goes farther than this it went astray."""
+_COARSE_WIDTH_PX: Final = 320
+_COARSE_STEP_PX: Final = 6
+_COARSE_ROUNDS: Final = 2
+_SHIFT_WIDTH_PX: Final = 160
+_COARSE_GRADIENT: Final = 4.0
+_COARSE_LEAST: Final = 30
+
+
+@dataclass(frozen=True, slots=True)
+class FlowField:
+    """Samples of the flow from the later frame back to the earlier one.
+
+    Attributes
+    ----------
+    later_px
+        (N, 2) grid points of the later frame.
+    earlier_px
+        (N, 2) where they were in the earlier frame after that was turned by ``later_from_earlier``.
+    information
+        (N, 2, 2) inverse covariance of ``earlier_px``, 1/px^2.
+    later_from_earlier
+        (3, 3) rotation that is already taken out.
+    textured
+        (N,) whether the picture fixes the flow in one direction at least, believed or not: where it does not, nothing was to be had.
+    believed
+        (N,) textured, seen by both frames, and the way back ends at the start.
+    camera
+        The model that pixels belong to (full size).
+    """
+
+    later_px: NDArray[np.float64]
+    earlier_px: NDArray[np.float64]
+    information: NDArray[np.float64]
+    later_from_earlier: NDArray[np.float64]
+    textured: NDArray[np.bool_]
+    believed: NDArray[np.bool_]
+    camera: CameraModel
+
+    def __len__(self) -> int:
+        return len(self.later_px)
+
+    def where(self, keep: NDArray[np.bool_] | slice | NDArray[np.intp]) -> FlowField:
+        """Return the samples that a mask, a slice or indices name."""
+        return replace(
+            self,
+            later_px=self.later_px[keep],
+            earlier_px=self.earlier_px[keep],
+            information=self.information[keep],
+            textured=self.textured[keep],
+            believed=self.believed[keep],
+        )
+
+
+def measure_flow(
+    earlier: NDArray[np.uint8],
+    later: NDArray[np.uint8],
+    camera: CameraModel,
+    later_from_earlier: NDArray[np.float64] | None,
+    params: ParallaxParams,
+) -> FlowField:
+    """Return the flow on a grid.
+
+    Parameters
+    ----------
+    earlier, later
+        (H, W) uint8, of the camera's size.
+    camera
+        Of both; assumed where it is not known.
+    later_from_earlier
+        (3, 3) rotation that takes coordinates of the earlier camera to those of the later one, from an attitude. None: a first estimate is made from the
+        flow of much reduced images.
+    params
+        Settings.
+    """
+    reduction = max(1, round(later.shape[1] / params.width_px))
+    size = (later.shape[1] // reduction, later.shape[0] // reduction)
+    small = camera.scaled_to(*size) if reduction > 1 else camera
+    before, now = (earlier, later) if reduction == 1 else (_reduced(earlier, size), _reduced(later, size))
+    turn = coarse_rotation(before, now, small) if later_from_earlier is None else later_from_earlier
+    turned, seen = turned_picture(before, small, turn)
+
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    back = np.asarray(search.calc(now, turned, None), np.float32)  # type: ignore[call-overload]  # no start is allowed
+    forth = np.asarray(search.calc(turned, now, None), np.float32)  # type: ignore[call-overload]
+    at = _grid(size, params.step_px)
+    column, row = at.T.astype(np.intp)
+    found = (at + back[row, column]).astype(np.float32)
+    found = _refined(now, turned, at, found)
+    home = cv2.remap(forth, found[:, None, 0], found[:, None, 1], cv2.INTER_LINEAR).reshape(-1, 2)
+    inside = cv2.remap(seen, found[:, None, 0], found[:, None, 1], cv2.INTER_NEAREST, borderValue=0.0)
+
+    information, strongest = _information(now, column, row, params)
+    missed = (found - at + home).astype(np.float64)
+    limit = (params.round_trip_px / params.flow_sigma_px) ** 2
+    returned = np.einsum("ni,nij,nj->n", missed, information, missed) < limit
+    textured = strongest > 1.0 / params.informative_sigma_px**2
+    offset = 0.5 * (reduction - 1)
+    return FlowField(
+        later_px=at.astype(np.float64) * reduction + offset,
+        earlier_px=found.astype(np.float64) * reduction + offset,
+        information=information / reduction**2,
+        later_from_earlier=np.asarray(turn, np.float64),
+        textured=textured,
+        believed=textured & returned & (inside.reshape(-1) > 0),
+        camera=camera,
+    )
+
+
+def coarse_rotation(
+    earlier: NDArray[np.uint8], later: NDArray[np.uint8], camera: CameraModel
+) -> NDArray[np.float64]:
+    """Return the rotation that explains most of the flow between two images, from much reduced ones: a start, good to about a degree.
+
+    Parameters
+    ----------
+    earlier, later
+        (H, W) uint8.
+    camera
+        Of both.
+
+    Returns
+    -------
+    (3, 3) ``later_from_earlier``; none at all where there is too little texture.
+    """
+    reduction = max(1, round(later.shape[1] / _COARSE_WIDTH_PX))
+    size = (later.shape[1] // reduction, later.shape[0] // reduction)
+    small = camera.scaled_to(*size)
+    before, now = _reduced(earlier, size), _reduced(later, size)
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    at = _grid(size, _COARSE_STEP_PX)
+    column, row = at.T.astype(np.intp)
+    strength = cv2.cornerMinEigenVal(now, 7, ksize=3)[row, column]
+    chosen = strength > np.quantile(strength, 0.4)
+    at, column, row = at[chosen], column[chosen], row[chosen]
+    if len(at) < _COARSE_LEAST:
+        return np.eye(3)
+    rotation = _by_shift(before, now, small)
+    ends = small.pixel_to_ray(at)
+    for _ in range(_COARSE_ROUNDS):
+        turned, seen = turned_picture(before, small, rotation)
+        back = np.asarray(search.calc(now, turned, None), np.float32)  # type: ignore[call-overload]  # no start is allowed
+        start = at + back[row, column]
+        inside = cv2.remap(seen, start[:, None, 0], start[:, None, 1], cv2.INTER_NEAREST, borderValue=0.0)
+        rays = small.pixel_to_ray(start)
+        good = (inside.reshape(-1) > 0) & np.isfinite(rays).all(axis=1) & np.isfinite(ends).all(axis=1)
+        if int(good.sum()) < _COARSE_LEAST:
+            break
+        rotation = fit_rotation(rays[good], ends[good]) @ rotation
+    return rotation
+
+
+def _by_shift(
+    earlier: NDArray[np.uint8], later: NDArray[np.uint8], camera: CameraModel
+) -> NDArray[np.float64]:
+    """Return the yaw and pitch that shift one picture onto the other (phase correlation): a turn of 15 degrees is too far for flow."""
+    reduction = max(1, round(later.shape[1] / _SHIFT_WIDTH_PX))
+    size = (later.shape[1] // reduction, later.shape[0] // reduction)
+    before, now = (_reduced(image, size).astype(np.float32) for image in (earlier, later))
+    window = cv2.createHanningWindow(size, cv2.CV_32F)
+    (right, down), _ = cv2.phaseCorrelate(before, now, window)
+    middle = np.array([camera.cx_px, camera.cy_px])
+    start, end = camera.pixel_to_ray(np.stack([middle, middle + np.array([right, down]) * reduction]))
+    if not np.isfinite(end).all():
+        return np.eye(3)
+    axis = np.cross(start, end)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-6:
+        return np.eye(3)
+    return rotation_matrix(axis / sine * np.arcsin(min(1.0, sine)))
+
+
+def _refined(
+    now: NDArray[np.uint8],
+    turned: NDArray[np.uint8],
+    at: NDArray[np.float32],
+    found: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Return the flow's ends after a Lucas-Kanade step at full resolution, where it stayed nearby."""
+    better, status, _ = cv2.calcOpticalFlowPyrLK(
+        now,
+        turned,
+        at[:, None],
+        found[:, None].copy(),
+        winSize=(_LK_WINDOW_PX, _LK_WINDOW_PX),
+        maxLevel=0,
+        criteria=_LK_CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    better = np.asarray(better, np.float32).reshape(-1, 2)
+    kept = (status.reshape(-1) > 0) & (np.linalg.norm(better - found, axis=1) < _LK_MOST_PX)
+    return np.where(kept[:, None], better, found).astype(np.float32)
+
+
+def _information(
+    image: NDArray[np.uint8], column: NDArray[np.intp], row: NDArray[np.intp], params: ParallaxParams
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the (N, 2, 2) information about the flow, and the larger eigenvalue (N,) of it before noise that no texture removes is added.
+
+    Lucas-Kanade's own: the sum of the gradients' products over the window, over the variance of the grey differences.
+    """
+    d_x = cv2.Scharr(image, cv2.CV_32F, 1, 0, scale=1.0 / 32.0)
+    d_y = cv2.Scharr(image, cv2.CV_32F, 0, 1, scale=1.0 / 32.0)
+    window = (_LK_WINDOW_PX, _LK_WINDOW_PX)
+    xx, xy, yy = (
+        np.asarray(cv2.boxFilter(product, cv2.CV_32F, window, normalize=False), np.float64)[row, column]
+        for product in (d_x * d_x, d_x * d_y, d_y * d_y)
+    )
+    # Neighbouring pixels are not independent (the lens, the sensor's interpolation): a quarter of them are.
+    scale = 0.25 / (2.0 * params.grey_sigma**2)
+    loose = 1.0 / params.loose_sigma_px**2
+    a, b, c = xx * scale + loose, xy * scale, yy * scale + loose
+    strongest = 0.5 * (a + c) + np.sqrt(0.25 * (a - c) ** 2 + b**2)
+    # Add the floor to the covariance: (T^-1 + s^2 I)^-1 = (I + s^2 T)^-1 T.
+    floor = params.flow_sigma_px**2
+    determinant = (1.0 + floor * a) * (1.0 + floor * c) - (floor * b) ** 2
+    t_determinant = a * c - b * b
+    information = np.empty((len(a), 2, 2))
+    information[:, 0, 0] = (a + floor * t_determinant) / determinant
+    information[:, 1, 1] = (c + floor * t_determinant) / determinant
+    information[:, 0, 1] = information[:, 1, 0] = b / determinant
+    return information, strongest
+
+
+def _grid(size: tuple[int, int], step_px: int) -> NDArray[np.float32]:
+    half = step_px // 2
+    columns, rows = np.meshgrid(np.arange(half, size[0], step_px), np.arange(half, size[1], step_px))
+    return np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float32)
+
+
+def _reduced(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    if (image.shape[1], image.shape[0]) == size:
+        return image
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,138 @@
+"""Parameters of the parallax method: one frozen model.
+
+Pixel figures hold in the working image, which is reduced to about ``width_px`` where the camera's is larger.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class ParallaxParams(BaseModel):
+    """All parameters of flow, egomotion, plane and ranges. Those of the void map are its own."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    # ------------------------------------------------------------------ flow
+    width_px: Annotated[
+        int,
+        Field(
+            ge=80,
+            le=4096,
+            description="Images are reduced to about this width. Larger: finer, slower (half of it cost 15 points of right directions).",
+        ),
+    ] = 640
+    step_px: Annotated[
+        int, Field(ge=2, le=64, description="Of the sample grid. Larger: fewer samples, faster.")
+    ] = 8
+    round_trip_px: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=10,
+            description="There and back must end within this, where the picture fixes the flow. Larger: laxer.",
+        ),
+    ] = 0.7
+    flow_sigma_px: Annotated[
+        float,
+        Field(gt=0, le=5, description="Noise of the flow of a well textured sample, one axis."),
+    ] = 0.3
+    grey_sigma: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=50,
+            description="Noise of grey values between the frames. Larger: more texture is needed for a sample to count.",
+        ),
+    ] = 3.0
+    loose_sigma_px: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=20,
+            description="Noise of the flow in a direction that the picture does not fix (along an edge, on a plain surface).",
+        ),
+    ] = 4.0
+    informative_sigma_px: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=10,
+            description="A sample says something of its range where its flow along the epipolar line is known this well. Larger: weaker texture counts.",
+        ),
+    ] = 0.6
+    least_informative: Annotated[
+        int,
+        Field(
+            ge=10,
+            le=10_000,
+            description="Fewer samples with texture than this are too little texture.",
+        ),
+    ] = 80
+
+    # ------------------------------------------------------------------ rotation and direction of travel
+    attitude_sigma_deg: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=20,
+            description="How far a given rotation may be wrong, an axis, one standard deviation. Larger: the flow decides more.",
+        ),
+    ] = 0.3
+    velocity_sigma_deg: Annotated[
+        float,
+        Field(gt=0, le=60, description="The same of a given direction of travel."),
+    ] = 7.0
+    cauchy_px: Annotated[
+        float,
+        Field(
+            gt=0, le=10, description="Residuals beyond this lose their weight. Larger: outliers pull more."
+        ),
+    ] = 0.7
+    most_samples: Annotated[
+        int, Field(ge=100, le=100_000, description="Samples used for the motion. Larger: slower.")
+    ] = 1500
+    correlated_samples: Annotated[
+        float,
+        Field(
+            ge=1,
+            le=1000,
+            description="Neighbouring samples share their windows, and lens and shutter bend the flow of whole regions: so many count as one where the motion is weighed against its priors. Larger: priors count more.",
+        ),
+    ] = 40.0
+    still_rad: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=0.1,
+            description="Flow that the best rotation alone leaves, 80th percentile; below it there was no motion. A standing camera has up to 0.0006, a moving one 0.0055 or more.",
+        ),
+    ] = 0.0015
+
+    # ------------------------------------------------------------------ planes
+    plane_share: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=1,
+            description="Share of the samples that one plane must explain, beside the model choice (GRIC). Larger: stricter.",
+        ),
+    ] = 0.85
+    wall_limit_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=20,
+            description="Nothing free beyond this: a wall ahead, whatever its shape. Larger: more walls.",
+        ),
+    ] = 3.0
+
+    # ------------------------------------------------------------------ without calibration
+    assumed_hfov_deg: Annotated[
+        float,
+        Field(
+            gt=20, lt=150, description="Horizontal field of view where neither it nor a calibration is known."
+        ),
+    ] = 70.0

@@ -17,6 +17,7 @@ _TRACK_GAP_M = 1.0
 """Two positions in a row further apart than this: what lies between was not seen to be flown."""
 _REMEMBERED_SHARE = 0.85
 """Of the vehicle's width with its margins: less of the margin beside what was already passed."""
+_ANOTHER_PLACE_M = 1.0
 _MATCH_RAD = math.radians(4.0)
 """A bearing stands for directions this close to it (half the vehicle's width at 5 m)."""
 
@@ -163,12 +164,29 @@ class Episode:
         self.east_m = east_m
         self.side: int = 0
         self.sweep_rad = 0.0
+        self._turned_at: tuple[float, float] | None = None
         self._blocked: list[_Blocked] = []
         self._bootstrapped_rad: list[float] = []
 
     def over(self, pose: Pose, distance_m: float) -> bool:
         """Whether the vehicle has left the place of this episode."""
         return math.dist((self.north_m, self.east_m), (pose.north_m, pose.east_m)) > distance_m
+
+    def begin_turn(self, pose: Pose) -> bool:
+        """Take note of where a turn begins; return whether its side is still to be chosen.
+
+        Turns at one place keep their side and add up. Another place is another view.
+        """
+        here = (pose.north_m, pose.east_m)
+        if self._turned_at is None or math.dist(self._turned_at, here) > _ANOTHER_PLACE_M:
+            self.side, self.sweep_rad = 0, 0.0
+            self._turned_at = here
+        return self.side == 0
+
+    @property
+    def has_turned(self) -> bool:
+        """Whether a turn was begun in this episode."""
+        return self._turned_at is not None
 
     def block(self, azimuth_rad: float, pose: Pose) -> None:
         """Remember a bearing that was found blocked here."""

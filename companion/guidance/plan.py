@@ -102,7 +102,7 @@ class Plan:
         if episode is None:
             return
         look = self._evidence.look_rad(pose)
-        if episode.side == 0:
+        if episode.begin_turn(pose):
             episode.side = self._freer_side(pose, look, now_ns) or self._goal_side(pose, look)
         # From where the last turn was to end, not from where it was found done: twelve steps of 30 are 360.
         goes_on = episode.sweep_rad > 0 and abs(wrap_rad(self.turn_target_rad - look)) <= 2 * TURN_DONE_RAD

@@ -288,8 +288,7 @@ class Switch:
         if pose is not None:
             self._plan.end_episode_left_behind(pose)
         episode = self._plan.episode
-        turned = episode is not None and episode.sweep_rad > 0.0
-        self._evidence.blocked = episode.blocked_rad if episode is not None and turned else ()
+        self._evidence.blocked = episode.blocked_rad if episode is not None and episode.has_turned else ()
 
     def _watch_progress(self, pose: Pose, wish: Wish, why: str, now_ns: int) -> None:
         """Give up, once, where the vehicle has got nowhere for ``give_up_s`` although the planner wants to."""

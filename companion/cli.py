@@ -1,4 +1,4 @@
-"""Command line of the companion service: ``companion run | config | check-config | demo | sim``."""
+"""Command line of the companion service: ``companion run | config | check-config | demo | sim | cameras``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import argparse
 import asyncio
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 from companion.errors import CompanionError, first_of
 
@@ -15,7 +16,8 @@ from companion.errors import CompanionError, first_of
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong usage."""
     words = list(sys.argv[1:] if argv is None else argv)
-    arguments = _sim_parser().parse_args(words[1:]) if words[:1] == ["sim"] else _parser().parse_args(words)
+    own_parser = _OWN_PARSERS.get(words[0]) if words else None
+    arguments = own_parser().parse_args(words[1:]) if own_parser else _parser().parse_args(words)
     try:
         code: int = arguments.command(arguments)
     except CompanionError as error:
@@ -59,8 +61,9 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     demo.set_defaults(command=_demo)
 
-    # Its command line is its own (``_sim_parser``); here it is for the list of commands.
+    # Their command lines are their own (``_OWN_PARSERS``); here they are for the list of commands.
     commands.add_parser("sim", help="fly closed loop in a simulated indoor world", add_help=False)
+    commands.add_parser("cameras", help="list cameras, take a picture, measure their timing", add_help=False)
     return parser
 
 
@@ -68,6 +71,19 @@ def _sim_parser() -> argparse.ArgumentParser:
     from companion.sim.command import sim_parser  # much that nothing else needs
 
     return sim_parser()
+
+
+def _cameras_parser() -> argparse.ArgumentParser:
+    from companion.cameras import cameras_parser
+
+    return cameras_parser()
+
+
+_OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
+    "sim": _sim_parser,
+    "cameras": _cameras_parser,
+}
+"""Commands whose modules import much that nothing else needs."""
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Literal, Self
@@ -105,7 +105,7 @@ class CameraSource:
         if thread is not None:
             await asyncio.to_thread(thread.stop)
 
-    async def frames(self) -> AsyncIterator[Frame]:
+    async def frames(self) -> AsyncGenerator[Frame, None]:
         """Yield the newest frame each time; does not end by itself.
 
         The image of a frame may be the driver's own memory: it is good until the next frame is asked for.

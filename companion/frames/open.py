@@ -18,7 +18,10 @@ FORMAT_LETTERS = {"auto": "", "MJPEG": "MJPG"}
 """Four letters of a pixel format where the configuration calls it otherwise."""
 
 
-def open_source(config: SourceConfig, *, clock: Clock, log: Log) -> FileSource | SocketSource | CameraSource:
+OpenedSource = FileSource | SocketSource | CameraSource
+
+
+def open_source(config: SourceConfig, *, clock: Clock, log: Log) -> OpenedSource:
     """Return the frame source that the configuration asks for; ``async with`` opens it.
 
     Parameters

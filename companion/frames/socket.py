@@ -18,7 +18,7 @@ import contextlib
 import socket
 import struct
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, Iterator
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -134,7 +134,7 @@ class SocketSource:
         if receiver is not None:
             await asyncio.to_thread(receiver.stop)
 
-    async def frames(self) -> AsyncIterator[Frame]:
+    async def frames(self) -> AsyncGenerator[Frame, None]:
         """Yield the newest frame each time; does not end by itself."""
         mailbox = self._mailbox
         if mailbox is None:

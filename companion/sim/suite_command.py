@@ -47,7 +47,11 @@ def add_suite_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
         "suite", help="many flights, and a report", description=_DESCRIPTION, allow_abbrev=False
     )
     parser.add_argument(
-        "--worlds", nargs="+", required=True, metavar="NAME|FILE.toml|random", help="which worlds"
+        "--worlds",
+        nargs="+",
+        required=True,
+        metavar="NAME|FILE.toml|random",
+        help="which worlds, separated by spaces or commas",
     )
     parser.add_argument(
         "--seeds", type=_seeds, default=(0,), metavar="A..B", help="from A to B; or a single one (default: 0)"
@@ -73,13 +77,16 @@ def add_suite_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="the suite's folder")
     parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
-    parser.set_defaults(command=_fly_suite)
+    parser.set_defaults(command=_fly_suite, parser=parser)
 
 
 def _fly_suite(arguments: argparse.Namespace) -> int:
     folder: Path = arguments.output
-    template = flight_spec(arguments, world=arguments.worlds[0], seed=0, method=arguments.methods[0])
-    flights = plan_flights(arguments.worlds, arguments.seeds, arguments.methods, template)
+    worlds = [name for words in arguments.worlds for name in words.split(",") if name]
+    if not worlds:
+        arguments.parser.error("--worlds: no world is named")
+    template = flight_spec(arguments, world=worlds[0], seed=0, method=arguments.methods[0])
+    flights = plan_flights(worlds, arguments.seeds, arguments.methods, template)
     # A fault of a world is one line now, not a hundred failed simulations later.
     for flight in {flight.spec.world: flight for flight in reversed(flights)}.values():
         world_of(flight)

@@ -107,6 +107,7 @@ def test_an_interrupted_suite_leaves_nothing_behind_and_says_how_to_go_on(tmp_pa
         (["--worlds", "room", "-j", "0"], "--jobs: found 0"),
         (["--worlds", "room", "--rate", "1000"], "frame_rate_hz: found 1000"),
         (["--worlds", "room", "room"], "asked for twice"),
+        (["--worlds", "room,corridor,room"], "asked for twice"),
     ],
 )  # fmt: skip
 def test_a_suite_that_cannot_be_flown_is_one_clear_line(tmp_path, capsys, words, said):

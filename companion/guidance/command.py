@@ -32,10 +32,14 @@ class YawSlew:
     """
 
     def __init__(self, config: GuidanceConfig) -> None:
-        self._rate_rad_s = math.radians(config.yaw_rate_deg_s)
-        self._paused_after_s = config.planner_timeout_s
+        self.set_limits(config)
         self._yaw_rad = 0.0
         self._at_ns = -(1 << 62)
+
+    def set_limits(self, config: GuidanceConfig) -> None:
+        """Take other limits; the yaw commanded last stays."""
+        self._rate_rad_s = math.radians(config.yaw_rate_deg_s)
+        self._paused_after_s = config.planner_timeout_s
 
     def forget(self) -> None:
         """Begin at the heading with the next command."""
@@ -99,6 +103,11 @@ class Command:
         self._table = table
         self._camera_yaw_rad = camera_yaw_rad
         self.yaw = YawSlew(config)
+
+    def set_limits(self, config: GuidanceConfig) -> None:
+        """Take other limits from the next setpoint on."""
+        self._config = config
+        self.yaw.set_limits(config)
 
     def act(self, state: State, s: Situation) -> Decision:
         """Return what is sent in a state (any but DISENGAGED)."""

@@ -88,6 +88,10 @@ class Gaps:
         self._least_m = least_m
         self._kept: Gap | None = None
 
+    def set_margin(self, margin_m: float) -> None:
+        """Take another margin; the gap that is kept ends where it did."""
+        self._margin_m = margin_m
+
     def forget(self) -> None:
         """Forget it."""
         self._kept = None

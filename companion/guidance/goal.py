@@ -23,12 +23,16 @@ class Goal:
     """
 
     def __init__(self, config: GuidanceConfig) -> None:
-        self._timeout_s = config.planner_timeout_s
+        self.set_limits(config)
         self.position: tuple[float, float] | None = None
         self._before: tuple[float, float] | None = None
         self._seen_ns = 0
         self._still: tuple[float, float] = (0.0, 0.0)
         self._still_since_ns = 0
+
+    def set_limits(self, config: GuidanceConfig) -> None:
+        """Take another limit; the goal stays."""
+        self._timeout_s = config.planner_timeout_s
 
     def forget(self) -> None:
         """Forget the goal: the next one is new."""

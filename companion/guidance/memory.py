@@ -37,10 +37,14 @@ class SeenBearings:
 
     def __init__(self, limits: GuidanceConfig, vehicle_width_m: float) -> None:
         self._near = NearObstacles(_REMEMBERED_SHARE * vehicle_width_m / 2)
+        self.set_limits(limits)
+        self._by_bin: dict[int, tuple[BearingRange, DetectionReport]] = {}
+
+    def set_limits(self, limits: GuidanceConfig) -> None:
+        """Take other limits: they count for what was measured before, too."""
         # A bearing is a direction in the world: turning the vehicle does not make it worse, so only the
         # limits on distance and age count here.
         self._limits = limits.model_copy(update={"redetect_yaw_deg": 180.0})
-        self._by_bin: dict[int, tuple[BearingRange, DetectionReport]] = {}
 
     def clear(self) -> None:
         """Forget everything."""

@@ -52,6 +52,10 @@ class Plan:
         self.probe_yaw_rad = 0.0
         self.probe_down_m = 0.0
 
+    def set_limits(self, config: GuidanceConfig) -> None:
+        """Take other limits; what has begun goes on, to the targets that it began with."""
+        self._config = config
+
     def forget(self) -> None:
         """Forget episode and anchor: the mode was left, or the local frame is another one."""
         self.episode = None

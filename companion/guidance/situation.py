@@ -140,6 +140,15 @@ class Evidence:
         self._pairs_after_ns = -(1 << 62)
         self._arrived = False
 
+    def set_limits(self, config: GuidanceConfig) -> None:
+        """Take other limits: what is known stays, and is judged by them."""
+        self._config = config
+        self.goal.set_limits(config)
+        self.seen.set_limits(config)
+        self.gaps.set_margin(config.step_margin_m)
+        if config.wall_n != self.votes.maxlen:
+            self.votes = deque(self.votes, maxlen=config.wall_n)
+
     # ------------------------------------------------------------------ what comes in
 
     def on_pose(self, pose: Pose, speed_m_s: float) -> None:

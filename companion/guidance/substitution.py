@@ -135,16 +135,34 @@ class Switch:
 
     # ------------------------------------------------------------------ inputs
 
-    def on_vehicle(self, *, armed: bool, offboard: bool, now_ns: int) -> None:
-        """Take the autopilot's mode; out of OFFBOARD/GUIDED or disarmed everything is forgotten."""
-        engaged = armed and offboard
+    def set_limits(self, config: GuidanceConfig) -> None:
+        """Take other limits from the next setpoint on; state and memory stay."""
+        self._config = config
+        for part in (self._evidence, self._plan, self._table, self._command):
+            part.set_limits(config)
+
+    def on_vehicle(self, *, armed: bool, offboard: bool, now_ns: int, off: str | None = None) -> None:
+        """Take the autopilot's mode; out of OFFBOARD/GUIDED or disarmed everything is forgotten.
+
+        Parameters
+        ----------
+        armed, offboard
+            As the autopilot says, or as it was just asked for.
+        now_ns
+            Our monotonic time.
+        off
+            Why protection is not wanted; setpoints then pass untouched. None: it is wanted.
+        """
+        engaged = armed and offboard and off is None
         if engaged == self._engaged:
+            if armed and offboard and off is not None and off != self.reason:
+                self._enter(State.DISENGAGED, off, now_ns)
             return
         was_unknown = self._engaged is None
         self._engaged = engaged
         if not engaged:
             self._forget_flight()
-            reason = "disarmed" if not armed else "not in OFFBOARD"
+            reason = "disarmed" if not armed else "not in OFFBOARD" if not offboard else off or ""
             if self.state is not State.DISENGAGED or was_unknown:
                 self._enter(State.DISENGAGED, reason, now_ns)
 

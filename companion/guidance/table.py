@@ -118,6 +118,10 @@ class Table:
             State.HOLD: self._from_hold,
         }
 
+    def set_limits(self, config: GuidanceConfig) -> None:
+        """Take other limits from the next setpoint on."""
+        self._config = config
+
     def change(self, s: Situation) -> Change | None:
         """Return the state that follows the present one and why, or None where it stays."""
         return self._rows[self._standing.state](s)

@@ -23,12 +23,8 @@ FUTURE_TOLERANCE_NS: Final = 5_000_000
 OLDEST_NS: Final = 2_000_000_000
 """An exposure outside these limits around now is not our clock's; the time of arrival counts then."""
 
-_FIRST_RETRY_S: Final = 0.1
-_LAST_RETRY_S: Final = 2.0
 _LOOK_S: Final = 0.1
 """Longest wait for an image before the thread looks at its deadline and whether it has to stop."""
-_HUNG_S: Final = 15.0
-"""A thread that has been in one call to the driver for this long does not come back soon."""
 _MOST_HUNG: Final = 3
 
 
@@ -44,11 +40,18 @@ class CameraLimits:
         (width, height); None: that of the first picture.
     latency_s
         How long before its time stamp a picture was exposed.
+    first_retry_s, last_retry_s
+        Wait before it is opened again, doubled each time that this does not help.
+    hung_s
+        A thread that has been in one call to the driver for this long does not come back soon.
     """
 
     timeout_s: float = 1.0
     size_px: tuple[int, int] | None = None
     latency_s: float = 0.0
+    first_retry_s: float = 0.1
+    last_retry_s: float = 2.0
+    hung_s: float = 15.0
 
 
 class CameraSource:
@@ -117,7 +120,7 @@ class CameraSource:
         try:
             while True:
                 try:
-                    newest = await asyncio.wait_for(mailbox.get(), 1.0)
+                    newest = await asyncio.wait_for(mailbox.get(), min(1.0, self._limits.hung_s))
                 except TimeoutError:
                     self._replace_a_hung_thread(mailbox)
                     continue
@@ -140,7 +143,7 @@ class CameraSource:
     def _replace_a_hung_thread(self, mailbox: NewestMailbox[_Stamped]) -> None:
         """Start another thread where one does not come back from the driver; no thread can be ended from outside."""
         thread = self._thread
-        if thread is None or thread.in_one_call_s() < _HUNG_S:
+        if thread is None or thread.in_one_call_s() < self._limits.hung_s:
             return
         self._hung = [hung for hung in self._hung if hung.is_alive()]
         if len(self._hung) >= _MOST_HUNG:
@@ -208,7 +211,7 @@ class _CaptureThread:
         return (self._clock.now_ns() - self._call_began_ns) / 1e9
 
     def _run(self) -> None:
-        retry_s = _FIRST_RETRY_S
+        retry_s = self._limits.first_retry_s
         announced = ""
         opened_before = False
         while not self._stopping.is_set():
@@ -224,12 +227,12 @@ class _CaptureThread:
             if self._stopping.is_set():
                 return
             if self._delivered_since_open:
-                retry_s, announced = _FIRST_RETRY_S, ""
+                retry_s, announced = self._limits.first_retry_s, ""
             if reason != announced:  # said once, not at every attempt
                 announced = reason
                 self._log.warning("camera_lost", reason=reason)
             self._stopping.wait(retry_s)
-            retry_s = min(2 * retry_s, _LAST_RETRY_S)
+            retry_s = min(2 * retry_s, self._limits.last_retry_s)
 
     def _captured_until_it_fails(self, capture: Capture) -> str:
         """Deliver images until the camera fails; return why it did, or "" at the end."""

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from companion.guidance.observation import DetectionReport, Pose
+from companion.guidance.observation import BearingRange, DetectionReport, Pose
 from companion.guidance.obstacles import NearObstacles
 
 SEC = 1_000_000_000
@@ -60,3 +60,23 @@ def test_after_a_minute_or_five_metres_it_is_forgotten():
     memory = remembered((2.0, 0.0))
     assert memory.free_m(0.0, pose(north=-3.5), SEC) is None
     assert memory.free_m(0.0, pose(), SEC) is None
+
+
+def test_what_is_measured_free_behind_it_erases_a_wrong_sighting_in_time():
+    memory = remembered((1.0, 0.0))
+    memory.add(seen((1.0, 0.0), seq=2))
+    through = DetectionReport(9, 9, "lowest_flow", pose=pose(), bearings=(BearingRange(0.0, 3.0, 0.0, 9),))
+    memory.add(through)
+    assert memory.free_m(0.0, pose(), 0) is not None, "one measurement is not enough"
+    memory.add(through)
+    assert memory.free_m(0.0, pose(), 0) is None
+
+
+def test_the_way_between_two_jambs_is_their_middle():
+    azimuth, room_m = remembered((1.0, -0.35), (1.0, 0.75)).clearer(0.0, pose(), 0)
+    assert math.degrees(azimuth) == pytest.approx(11.3, abs=3.0)
+    assert room_m > 0.5
+
+
+def test_an_open_way_is_not_moved():
+    assert NearObstacles(0.4).clearer(0.3, pose(), 0)[0] == 0.3

@@ -92,11 +92,13 @@ def _run(arguments: argparse.Namespace) -> int:
     from companion.config_file import load_config
     from companion.log import open_log
     from companion.service import Service
+    from companion.systemd import ServiceNotifier
 
+    notifier = ServiceNotifier.from_environment()  # before anything is started that could inherit it
     config = load_config(arguments.config) if arguments.config else Config()
 
     async def serve() -> None:
-        service = Service(config, clock=RealClock(), log=log)
+        service = Service(config, clock=RealClock(), log=log, notifier=notifier)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)

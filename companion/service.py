@@ -8,6 +8,7 @@ vision         events     owns the worker process: start, deadline, restart (``v
 health         10 Hz      judges inputs, tells the switch S of failures, announces changes of state
 heartbeat      1 Hz       our HEARTBEAT, only while health has run
 status         config     one line with all rates and ages
+systemd        1 Hz       feeds its watchdog, only while health has run; where it started us
 =============  =========  ==============================================================================
 
 Setpoints have no loop: they are decided and sent in the call that received them (``mavlink.proxy``).
@@ -34,6 +35,7 @@ from companion.mavlink.identity import Identity
 from companion.mavlink.link import UdpEndpoint
 from companion.mavlink.proxy import InlineProxy
 from companion.mavlink.signing import open_signatures
+from companion.systemd import ServiceNotifier
 from companion.vision.supervisor import VisionSupervisor
 
 _HEALTH_PERIOD_NS: Final = 100_000_000
@@ -58,6 +60,8 @@ class Service:
         Takes the events.
     open_frames
         Makes the frame source; by default the one that the configuration names. A simulator gives its own.
+    notifier
+        Whom to tell that the service works; by default nobody.
     """
 
     def __init__(
@@ -67,6 +71,7 @@ class Service:
         clock: Clock,
         log: Log,
         open_frames: Callable[[], FrameSource] | None = None,
+        notifier: ServiceNotifier | None = None,
     ) -> None:
         self._config = config
         self._clock = clock
@@ -74,7 +79,9 @@ class Service:
         self._open_frames = open_frames or partial(open_source, config.source, clock=clock, log=log)
         self._links: tuple[UdpEndpoint, ...] = ()
         self._stop = asyncio.Event()
+        self._notifier = notifier if notifier is not None else ServiceNotifier(None)
         self._health_ns = clock.now_ns()
+        self._health_has_run = False
         self._last_frame_ns: int | None = None
         self._source_fault: str | None = "no frame yet"
         self._too_slow = False
@@ -128,6 +135,8 @@ class Service:
                 "heartbeat": self._heartbeat(flight, identity),
                 "status": self._status(flight, vision, proxy),
             }
+            if self._notifier.enabled:
+                loops["systemd"] = self._tell_systemd(flight)
             log.info(
                 "service_started",
                 planner=_listening(planner),
@@ -139,6 +148,7 @@ class Service:
                 async with asyncio.TaskGroup() as group:
                     tasks = [group.create_task(loop, name=name) for name, loop in loops.items()]
                     await self._stop.wait()
+                    self._notifier.stopping()
                     for task in tasks:
                         task.cancel()
             finally:
@@ -210,6 +220,7 @@ class Service:
             flight.check_links(now_ns)
             flight.announce()
             self._health_ns = now_ns
+            self._health_has_run = True
             await clock.sleep_until_ns(now_ns + _HEALTH_PERIOD_NS)
 
     async def _heartbeat(self, flight: Interception, identity: Identity) -> None:
@@ -219,6 +230,19 @@ class Service:
             if now_ns - self._health_ns <= _HEALTH_LATE_NS:
                 identity.heartbeat(flight.mav_state(now_ns))
             await self._clock.sleep_until_ns(now_ns + _HEARTBEAT_PERIOD_NS)
+
+    async def _tell_systemd(self, flight: Interception) -> None:
+        """Tell systemd that the service is ready and that it works, fed by the loops that it speaks for."""
+        notifier, ready = self._notifier, False
+        while True:
+            now_ns = self._clock.now_ns()
+            if self._health_has_run and now_ns - self._health_ns <= _HEALTH_LATE_NS:
+                if not ready:
+                    notifier.ready()
+                    ready = True
+                status = flight.status(now_ns)
+                notifier.working(f"{status['state']}: {status['reason']}; frames {status['frames_hz']}/s")
+            await self._clock.sleep_until_ns(now_ns + notifier.period_ns)
 
     async def _status(self, flight: Interception, vision: VisionSupervisor, proxy: InlineProxy) -> None:
         """Write the status line."""

@@ -164,7 +164,7 @@ async def _with_source(config: SourceConfig, use: Callable[[OpenedSource, Clock]
             try:
                 return await use(source, clock)
             except TimeoutError as error:
-                raise SourceError(f"{config.url}: no frame within {_PATIENCE_S:g} s") from error
+                raise SourceError(f"{config.shown_url}: no frame within {_PATIENCE_S:g} s") from error
 
 
 def _try(opener: Callable[[], Capture]) -> None:

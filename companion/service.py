@@ -141,7 +141,7 @@ class Service:
                 "service_started",
                 planner=_listening(planner),
                 autopilot=_listening(autopilot),
-                source=config.source.url,
+                source=config.source.shown_url,
                 preset=config.detector.preset,
             )
             try:

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 from companion.config.section import Disagreement, Section
 
 _SCHEMES: Final = ("v4l2", "picamera2", "rtsp", "rtsps", "udp", "gst", "file", "tcp")
-_CONTROL: Final = re.compile(r"\s*([a-z0-9_]+)\s*=\s*([^=,]*[^=,\s])\s*")
+_CONTROL: Final = re.compile(r"\s*([A-Za-z0-9_]+)\s*=\s*([^=,]*[^=,\s])\s*")
 
 
 def _checked_url(url: str) -> str:
@@ -133,6 +133,15 @@ class SourceConfig(Section):
     def where(self) -> str:
         """The part of the URL after the scheme and its colon."""
         return self.url.partition(":")[2]
+
+    @property
+    def shown_url(self) -> str:
+        """The URL without user and password, for logs."""
+        scheme, separator, rest = self.url.partition("://")
+        if not separator:
+            return self.url
+        host, slash, path = rest.partition("/")
+        return f"{scheme}://{host.rpartition('@')[2]}{slash}{path}"
 
     @property
     def size_px(self) -> tuple[int, int] | None:

@@ -31,7 +31,7 @@ class CapturedImage:
     digest
         Of the image as it came: two alike are the same picture.
     lost
-        Images that the driver dropped just before this one.
+        Images that the driver dropped, or that were passed over undecoded, just before this one.
     give_back
         Tells the camera that nobody looks at the image any more. For any thread; never blocks.
     """

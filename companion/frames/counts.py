@@ -26,7 +26,7 @@ class FrameCounts:
     repeated
         Pictures that were the one before again, bit for bit.
     lost_by_driver
-        Frames that a camera's driver dropped because nobody fetched them in time.
+        Frames that a camera's driver or a stream's decoder dropped because nobody fetched them in time.
     """
 
     delivered: int = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from companion.clock import Clock
@@ -11,6 +12,7 @@ from companion.errors import SourceError
 from companion.frames.camera import CameraLimits, CameraSource
 from companion.frames.capture import Capture
 from companion.frames.file import FileSource
+from companion.frames.quiet import quieten_decoders
 from companion.frames.socket import SocketSource
 from companion.log import Log
 
@@ -38,6 +40,7 @@ def open_source(config: SourceConfig, *, clock: Clock, log: Log) -> OpenedSource
     companion.errors.SourceError
         When the configuration does not say enough, or what the source needs is not installed.
     """
+    quieten_decoders()
     match config.scheme:
         case "":
             raise SourceError('source.url is empty: it names the camera, such as "v4l2:/dev/video0"')
@@ -55,7 +58,9 @@ def open_source(config: SourceConfig, *, clock: Clock, log: Log) -> OpenedSource
             )
         case _:
             limits = CameraLimits(config.timeout_s, config.size_px, config.latency_ms / 1e3)
-            return CameraSource(capture_opener(config), name=config.url, clock=clock, log=log, limits=limits)
+            return CameraSource(
+                capture_opener(config), name=config.shown_url, clock=clock, log=log, limits=limits
+            )
 
 
 def capture_opener(config: SourceConfig) -> Callable[[], Capture]:
@@ -66,6 +71,7 @@ def capture_opener(config: SourceConfig) -> Callable[[], Capture]:
     companion.errors.SourceError
         When what it needs is not installed; says what is missing. Recordings and raw frames are no cameras.
     """
+    quieten_decoders()
     match config.scheme:
         case "v4l2":
             from companion.frames.v4l2.capture import V4l2Opener, V4l2Wish
@@ -80,5 +86,22 @@ def capture_opener(config: SourceConfig) -> Callable[[], Capture]:
                 controls=config.control_values,
             )
             return V4l2Opener(wish, LinuxKernel())
+        case "rtsp" | "rtsps" | "udp":
+            from companion.frames.stream import StreamCapture
+
+            return partial(StreamCapture, config.url, config.timeout_s, name=config.shown_url)
+        case "picamera2":
+            from companion.frames.picamera import PicameraCapture, PicameraWish, picamera2_module
+
+            return partial(
+                PicameraCapture,
+                picamera2_module(),
+                PicameraWish(int(config.where), config.size_px, config.rate_hz, config.control_values),
+            )
+        case "gst":
+            from companion.frames.gstreamer import GstreamerCapture, gstreamer_command
+
+            command = gstreamer_command(config.where, config.width_px, config.height_px)
+            return partial(GstreamerCapture, command, config.width_px, config.height_px)
         case _:
-            raise SourceError(f"{config.url}: not a camera")
+            raise SourceError(f"{config.shown_url}: not a camera")

@@ -110,7 +110,7 @@ class ImageFolder:
         self._folder = folder
         self._interval_ns = round(1e9 / fps_hz)
         table = folder / TIMESTAMPS_NAME
-        if table.exists():
+        if table.is_file():
             self._names, times_s = _read_timestamps(table)
             self._offsets_ns = [round((time_s - times_s[0]) * 1e9) for time_s in times_s]
             if len(times_s) > 1:
@@ -277,7 +277,8 @@ def natural_key(name: str) -> tuple[tuple[int, int | str], ...]:
 
 def _read_grey(path: Path) -> NDArray[np.uint8] | None:
     try:
-        data = np.fromfile(path, dtype=np.uint8)
+        # A name in timestamps.csv may be that of a pipe, and opening one waits for somebody to write into it.
+        data = np.fromfile(path, dtype=np.uint8) if path.is_file() else np.empty(0, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
     except (OSError, cv2.error):
         return None

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import cv2
@@ -149,3 +150,15 @@ def test_paths_that_hold_nothing_are_clear_errors(tmp_path: Path):
         open_recording(Path("/dev/null"), fps_hz=10)
     with pytest.raises(SourceError, match=r"cannot be read|no such file"):
         open_recording(Path("a\0b"), fps_hz=10)
+
+
+def test_a_pipe_where_an_image_should_be_is_an_image_that_cannot_be_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    cv2.imwrite(str(tmp_path / "real.png"), np.full((24, 32), 9, np.uint8))
+    (tmp_path / "timestamps.csv").write_text("file,time_s\npipe.png,0\nreal.png,1\n")
+    recording = open_recording(tmp_path, 10.0)
+    first, second = recording.read(), recording.read()
+    assert first is not None
+    assert first.image is None
+    assert second is not None
+    assert second.image is not None

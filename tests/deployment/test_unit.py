@@ -1,0 +1,88 @@
+"""The systemd unit, by systemd's own judge; what is installed where is in one accord."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+UNIT = ROOT / "systemd" / "void-companion.service"
+INSTALLER = ROOT / "install.sh"
+
+ANALYZE = shutil.which("systemd-analyze") or ""
+
+needs_systemd = pytest.mark.skipif(not ANALYZE, reason="systemd-analyze is not installed")
+
+
+def settings() -> dict[str, list[str]]:
+    """Return the unit's settings; one may stand there several times."""
+    found: dict[str, list[str]] = {}
+    for line in UNIT.read_text().splitlines():
+        if match := re.fullmatch(r"([A-Za-z]+)=(.*)", line):
+            found.setdefault(match[1], []).append(match[2])
+    return found
+
+
+def analyze(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([ANALYZE, *words], capture_output=True, text=True, timeout=60)
+
+
+@needs_systemd
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path):
+    # The program is not installed where tests run: another one that exists stands in for it.
+    path = tmp_path / UNIT.name
+    path.write_text(re.sub(r"(?m)^ExecStart=\S+", "ExecStart=/bin/true", UNIT.read_text()))
+    judged = analyze("verify", "--man=no", str(path))
+    assert judged.returncode == 0, judged.stderr
+    # Not every fault changes the code: an unknown key is only complained of. Other units of the machine are not ours.
+    assert UNIT.name not in judged.stderr
+
+
+@needs_systemd
+def test_the_judge_is_heard(tmp_path):
+    path = tmp_path / UNIT.name
+    path.write_text(re.sub(r"(?m)^ExecStart=\S+", "ExecStart=/bin/true", UNIT.read_text()) + "Nonsense=1\n")
+    assert UNIT.name in analyze("verify", "--man=no", str(path)).stderr
+
+
+@needs_systemd
+def test_the_service_is_exposed_by_at_most_2_0():
+    judged = analyze("security", "--offline=yes", "--threshold=20", "--no-pager", str(UNIT))
+    assert judged.returncode == 0, judged.stdout
+
+
+def test_the_service_is_never_given_up():
+    assert settings()["StartLimitIntervalSec"] == ["0"]
+    assert settings()["Restart"] == ["always"]
+
+
+def test_unit_and_installer_mean_the_same_paths_and_user():
+    installer = INSTALLER.read_text()
+    (start,) = settings()["ExecStart"]
+    assert "name=void-companion\nprefix=/opt/$name\nsettings=/etc/$name\n" in installer
+    assert start == "/opt/void-companion/bin/companion run -c /etc/void-companion/config.toml"
+    users = (ROOT / "systemd" / "void-companion.sysusers").read_text()
+    assert f"u {settings()['User'][0]} " in users
+    for group in settings()["SupplementaryGroups"][0].split():
+        assert f"m {settings()['User'][0]} {group}\n" in users
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--nonsense"], "unknown option --nonsense"),
+        (["--keep-config"], "goes with --uninstall"),
+        (["--wheels"], "--wheels needs a folder"),
+        (["--wheels", "/nowhere"], "/nowhere is not a folder"),
+    ],
+)
+def test_the_installer_refuses_wrong_words_in_one_line_before_it_does_anything(words, said):
+    done = subprocess.run([str(INSTALLER), *words], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""

@@ -45,7 +45,7 @@ class DetectorParams(BaseModel):
             le=100_000,
             description="fast: most locations that the flow starts from in the first loop, which estimates p, n and k. Larger: slower, nearer to exact.",
         ),
-    ] = 1000
+    ] = 2000
     fast_points: Annotated[
         int,
         Field(ge=50, le=100_000, description="fast: the same in the other loops."),

@@ -9,7 +9,8 @@ Measured on every pair of a stream, each with frames that are as a camera gives 
 ``first``
     Our first loop on a fresh detector: both frames prepared, p, n and k estimated.
 ``other``
-    Our other loops, as in a stream: one frame prepared (the earlier one was, when it was the later frame of the pair before), p, n and k kept.
+    Our other loops, as in a stream: one frame prepared (the earlier one was, when it was the later frame of the pair before), p, n and k kept;
+    from the frame to its answer. What follows the answer, renewing the locations for the next pair, is timed on its own (``renewal``).
 ``floor``
     The Lucas-Kanade calls alone, there and back, on the very points that ``other`` started from, with its window, levels and iterations, on plain arrays.
 ``sfm``
@@ -64,6 +65,7 @@ class Samples:
         default_factory=lambda: {name: [] for name in ("first", "other", "sfm")}
     )
     points: dict[str, list[int]] = field(default_factory=lambda: {name: [] for name in ("first", "other")})
+    renewal_s: list[float] = field(default_factory=list)
     kinds: dict[str, dict[str, int]] = field(default_factory=lambda: {name: {} for name in SERIES})
 
     def note(self, series: str, seconds: float | None, kind: str) -> None:
@@ -246,6 +248,7 @@ class _Paths:
         self._earlier = self._detector.prepare(self._stream[0])
         later = self._detector.prepare(self._stream[1])
         self._detector.detect(self._earlier, later)
+        self._detector.renew(later)
         self._earlier = later
 
     def warm_up(self, pair: int) -> None:
@@ -298,6 +301,9 @@ class _Paths:
         detection = detector.detect(earlier, later).detection
         end = time.perf_counter()
         if series == "other":
+            begin_renewal = time.perf_counter()
+            detector.renew(later)
+            samples.renewal_s.append(time.perf_counter() - begin_renewal)
             self._earlier = later
             if earlier.seeds_px is not None:
                 self._points[pair] = earlier.seeds_px
@@ -358,6 +364,7 @@ def _summary(samples: Samples, memory: dict[str, float | None]) -> dict[str, Any
     seconds, counted = samples.seconds, len(samples.seconds["other"])
     return {
         **{f"{name}_s": _spread(seconds[name]) for name in SERIES},
+        "renewal_s": _spread(samples.renewal_s),
         "literal_over_first": _ratio(seconds["literal"], seconds["first"]),
         "literal_over_other": _ratio(seconds["literal_other"], seconds["other"]),
         "other_over_floor": _ratio(seconds["other"], seconds["floor"]),

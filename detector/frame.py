@@ -23,7 +23,9 @@ class Frame:
         Why it cannot be used, if so.
     seeds_px
         (N, 2) where the flow starts when this is the earlier frame: found when first needed, or carried over from
-        the pair that it was the later frame of. None where nothing is known yet.
+        the pair that it was the later frame of, and renewed. None where nothing is known yet.
+    carried_px
+        (N, 2) ends of the vectors of the pair that it was the later frame of, not renewed yet.
     n_features
         How many key points were found, before any cap. None where nobody has looked.
     """
@@ -31,6 +33,7 @@ class Frame:
     image: NDArray[np.uint8]
     fault: FrameFault | None
     seeds_px: NDArray[np.float32] | None = None
+    carried_px: NDArray[np.float64] | None = None
     n_features: int | None = None
 
 

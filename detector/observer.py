@@ -362,6 +362,14 @@ class VoidObserver:
             return Observation(partner, time_ns)
         return self._observe_pair(partner, frame, time_ns, pose, camera)
 
+    def between_frames(self) -> None:
+        """Do what the next answer needs and this one does not; to be called once this one is on its way.
+
+        Without it, :meth:`observe` does the same later: the answers do not depend on it, only when they come.
+        """
+        if self._kept and isinstance(self._detector, VoidDetector):
+            self._detector.renew(self._kept[-1].frame)
+
     def _observe_pair(
         self,
         earlier: _Kept,

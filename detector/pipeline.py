@@ -136,6 +136,27 @@ class VoidDetector:
         """
         return prepare(image, self.params)
 
+    def renew(self, frame: Frame) -> None:
+        """Find where the flow starts when this is the earlier frame, if that is not known yet.
+
+        :meth:`detect` does it when it needs it. Done between two frames, it keeps no answer waiting: key points are what takes longest, and
+        the answer on a frame does not need its own, only those of the frame before.
+        """
+        params, finder = self.params, self._seeds
+        if params.speed == "exact" or frame.seeds_px is not None or frame.fault is not None:
+            return
+        if frame.carried_px is not None:
+            frame.seeds_px, frame.carried_px = finder.renew(frame.image, frame.carried_px), None
+            if frame.seeds_px is not None:
+                renewed = len(frame.seeds_px)
+                frame.n_features = (
+                    renewed
+                    if renewed >= params.min_features
+                    else finder.count(frame.image, params.min_features)
+                )
+                return
+        frame.seeds_px, frame.n_features = finder.find(frame.image)
+
     def detect(
         self,
         earlier: NDArray[np.uint8] | Frame,
@@ -223,8 +244,8 @@ class VoidDetector:
                     if frame.seeds_px is None:
                         frame.seeds_px = finder.all_of(frame.image)
                         frame.n_features = len(frame.seeds_px)
-            elif earlier.seeds_px is None:
-                earlier.seeds_px, earlier.n_features = finder.find(earlier.image)
+            else:
+                self.renew(earlier)
             if later.n_features is None and self._n is None:
                 later.n_features = finder.count(later.image, params.min_features)
         seeds = earlier.seeds_px
@@ -241,22 +262,20 @@ class VoidDetector:
         return seeds
 
     def _carry(self, later: Frame, tracks: Tracks, notes: _Notes) -> None:
-        """Let the vectors' ends be where the flow starts when the later frame is the earlier one.
+        """Let the vectors' ends be where the flow starts when the later frame is the earlier one; they are renewed when there is time.
 
-        In the other loops this is also where its key points are counted: those that were followed into it, and the new ones.
+        In the other loops this is also where its key points are counted: those that were followed into it, and where these are too few,
+        all.
         """
         params = self.params
         if params.speed == "exact" or later.seeds_px is not None:
             return
-        with notes.step("features"):
-            later.seeds_px = self._seeds.renew(later.image, tracks.end_px)
-            if later.n_features is None:
-                renewed = 0 if later.seeds_px is None else len(later.seeds_px)
-                later.n_features = (
-                    renewed
-                    if renewed >= params.min_features
-                    else self._seeds.count(later.image, params.min_features)
-                )
+        later.carried_px = tracks.end_px
+        if later.n_features is None:
+            later.n_features = len(tracks)
+            if later.n_features < params.min_features:
+                with notes.step("features"):
+                    self.renew(later)
         notes.fields["n_features_later"] = later.n_features
         if later.n_features < params.min_features:
             raise _Stop(

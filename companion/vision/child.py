@@ -133,6 +133,11 @@ class VoidPipeline:
         observation = observer.observe(frame.image, frame.time_ns, camera_pose)
         return self._report(frame, pose, observation, model, r_ned_from_camera, began_s)
 
+    def between_frames(self) -> None:
+        """Prepare for the next frame (:meth:`VoidObserver.between_frames`)."""
+        if self._observer is not None:
+            self._observer.between_frames()
+
     def _model_for(self, width_px: int, height_px: int) -> CameraModel:
         if self._calibrated is None:
             return CameraModel.from_hfov(width_px, height_px, self._hfov_deg)

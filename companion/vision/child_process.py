@@ -32,7 +32,7 @@ from companion.vision.messages import (
     pack_from_worker,
     unpack_to_worker,
 )
-from companion.vision.pipeline import Pipeline, load_factory
+from companion.vision.pipeline import Pipeline, WithIdleWork, load_factory
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _MAX_TRACEBACK = 20_000
@@ -77,6 +77,8 @@ def _serve(connection: socket.socket) -> int:
                 image = slots.read(message.slot, message.height_px, message.width_px)
                 report = pipeline.detect(Frame(image, message.time_ns, message.seq), message.pose)
                 _send(connection, Answer(message.frame_id, report))
+                if isinstance(pipeline, WithIdleWork):
+                    pipeline.between_frames()
     return 0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from typing import Protocol, cast
+from typing import Protocol, cast, runtime_checkable
 
 from companion.config import CameraConfig, DetectorConfig
 from companion.errors import ConfigError
@@ -23,6 +23,15 @@ class Pipeline(Protocol):
 
         An exception is reported with its traceback and ends the process.
         """
+        ...
+
+
+@runtime_checkable
+class WithIdleWork(Protocol):
+    """A pipeline that prepares for the next frame while the last report is already on its way."""
+
+    def between_frames(self) -> None:
+        """Do so; called after each report. An exception is reported and ends the process."""
         ...
 
 

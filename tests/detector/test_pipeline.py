@@ -308,6 +308,30 @@ def test_p_n_and_k_are_kept_until_reset() -> None:
     assert without_times(detector.detect(*other_pair).detection) == without_times(of_other)
 
 
+@pytest.mark.parametrize("preset", ["paper", "default"])
+def test_renewing_between_two_frames_saves_the_next_pair_the_work_and_changes_no_answer(
+    preset: PresetName,
+) -> None:
+    images = [corridor_frame(i * STEP_M) for i in range(4)]
+
+    def answers(between: bool) -> list[Detection]:
+        detector = VoidDetector(DetectorParams.preset(preset, fast_first_points=400, fast_points=300))
+        earlier, found = detector.prepare(images[0]), []
+        for image in images[1:]:
+            later = detector.prepare(image)
+            found.append(detector.detect(earlier, later).detection)
+            assert later.seeds_px is None
+            if between:
+                detector.renew(later)
+                assert later.seeds_px is not None
+            earlier = later
+        return found
+
+    found = answers(between=True)
+    assert any(not isinstance(one, NoDetection) for one in found)
+    assert [without_times(one) for one in found] == [without_times(one) for one in answers(between=False)]
+
+
 # ---------------------------------------------------------------------- rotation
 
 TURN_DEG = (3.0, -2.0, 2.5)

@@ -47,6 +47,25 @@ def echo(detector: DetectorConfig, camera: CameraConfig):
     return Echo()
 
 
+class Counts(Echo):
+    """Reports how often it had time between two frames as x_px."""
+
+    def __init__(self):
+        self._times = 0
+
+    def detect(self, frame, pose):
+        return DetectionReport(
+            frame.seq, frame.time_ns, "lowest_flow", x_px=float(self._times), y_px=0.0, pose=pose
+        )
+
+    def between_frames(self):
+        self._times += 1
+
+
+def counts(detector: DetectorConfig, camera: CameraConfig):
+    return Counts()
+
+
 def unusable(detector: DetectorConfig, camera: CameraConfig):
     raise ConfigError(f"{camera.file}: no such file")
 

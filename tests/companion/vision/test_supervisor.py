@@ -130,6 +130,12 @@ async def test_frames_become_reports_with_their_own_time_number_and_pose():
         assert alive(bench.status.pid)
 
 
+async def test_a_pipeline_prepares_for_the_next_frame_after_each_report():
+    async with running("counts") as bench:
+        await bench.ready()
+        assert [(await bench.report_on(grey(90))).x_px for _ in range(3)] == [0.0, 1.0, 2.0]
+
+
 async def test_the_caller_may_reuse_its_image_at_once():
     async with running() as bench:
         await bench.ready()

@@ -18,7 +18,7 @@ from vm.wheels import provide_wheels
 
 _PROJECT: Final = Path(__file__).resolve().parents[2]
 _GUEST: Final = Path(__file__).resolve().parent / "guest"
-_GROUPS: Final = ("cameras", "flight")
+_GROUPS: Final = ("cameras", "flight", "service")
 _DESCRIPTION = """\
 Boot a stock Debian 12 kernel in QEMU with the kernel's test camera (vivid), install the built wheel there, and check it
 on a real V4L2 driver and under a real systemd. Needs root the first time, for debootstrap. What is checked, and how to
@@ -96,6 +96,9 @@ def _try(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     results.mkdir()
     checks = folder / "checks"
     shutil.copytree(_GUEST, checks, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(_PROJECT / "systemd", checks / "install" / "systemd")
+    for name in ("install.sh", "README.md", "SAFETY.md", "LICENSE"):
+        shutil.copy(_PROJECT / name, checks / "install")
     (checks / "plan.json").write_text(json.dumps({"groups": groups, "capture_s": arguments.capture}))
     _say(f"the guest; its console: {folder / 'console.log'}")
     follower = _Follower(results / "results.jsonl")

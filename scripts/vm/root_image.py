@@ -23,6 +23,7 @@ _PACKAGES: Final = (
     "udev",
     "dbus",
     "kmod",
+    "procps",
     "iproute2",
     "python3",
     "python3-venv",
@@ -168,8 +169,11 @@ def _install(root: Path, wheels: list[Path], *, log: Path) -> None:
     for wheel in wheels:
         shutil.copyfile(wheel, carried / wheel.name)
     inside = [f"/tmp/wheels/{wheel.name}" for wheel in wheels]  # noqa: S108  in the guest's root, where nobody else is
-    run([*NICE, "chroot", str(root), "python3", "-m", "venv", VENV], log=log, what="the guest's Python")
-    pip = [
+    plain = {
+        "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
+        "LANG": "C.UTF-8",
+    }  # the host's settings of pip are not the guest's
+    python = [
         f"{VENV}/bin/python",
         "-m",
         "pip",
@@ -179,7 +183,13 @@ def _install(root: Path, wheels: list[Path], *, log: Path) -> None:
         "--no-deps",
         "--no-cache-dir",
     ]
-    run([*NICE, "chroot", str(root), *pip, *inside], log=log, what="the dependencies in the guest")
+    for words in (["python3", "-m", "venv", VENV], [*python, *inside]):
+        run(
+            [*NICE, "chroot", str(root), *words],
+            log=log,
+            what="the dependencies in the guest",
+            environment=plain,
+        )
     shutil.rmtree(carried)
 
 

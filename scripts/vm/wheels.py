@@ -1,4 +1,4 @@
-"""The wheel under test and everything it depends on, for the guest's Python."""
+"""The project's wheel and everything it depends on, for another machine's Python."""
 
 from __future__ import annotations
 
@@ -11,16 +11,13 @@ from typing import Final
 from vm.errors import VmError, run
 from vm.tools import NICE
 
-_GUEST_PYTHON: Final = "3.11"  # Debian 12
-_PLATFORMS: Final = (
-    "manylinux_2_28_x86_64",
-    "manylinux_2_27_x86_64",
-    "manylinux_2_17_x86_64",
-    "manylinux2014_x86_64",
-)
+DEBIAN_12_PYTHON: Final = "3.11"
+_GLIBC: Final = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux2014")
 
 
-def provide_wheels(project: Path, cache: Path, *, log: Path) -> tuple[Path, str]:
+def provide_wheels(
+    project: Path, cache: Path, *, log: Path, python_version: str = DEBIAN_12_PYTHON, machine: str = "x86_64"
+) -> tuple[Path, str]:
     """Build the project's wheel and fetch what it needs; return the folder with both, and the former's name.
 
     Parameters
@@ -31,6 +28,8 @@ def provide_wheels(project: Path, cache: Path, *, log: Path) -> tuple[Path, str]
         Folder of what is kept between runs; wheels that are there already are not fetched again.
     log
         Takes pip's output.
+    python_version, machine
+        What they are for, such as 3.11 and aarch64.
 
     Raises
     ------
@@ -49,8 +48,8 @@ def provide_wheels(project: Path, cache: Path, *, log: Path) -> tuple[Path, str]
     name = tomllib.loads((project / "pyproject.toml").read_text())["project"]["name"].replace("-", "_")
     for old in folder.glob(f"{name}-*.whl"):
         old.unlink()
-    options = ["--only-binary=:all:", "--implementation=cp", f"--python-version={_GUEST_PYTHON}"]
-    options += [f"--platform={platform}" for platform in _PLATFORMS]
+    options = ["--only-binary=:all:", "--implementation=cp", f"--python-version={python_version}"]
+    options += [f"--platform={glibc}_{machine}" for glibc in _GLIBC]
     source = [f"--find-links={folder}", "-d", str(folder)]
     run([*pip, "download", *options, *source, str(wheels[0])], log=log, what="the wheel's dependencies")
     return folder, wheels[0].name

@@ -13,7 +13,12 @@ FORMATS = ("GREY", "YUYV", "NV12", "MJPEG")
 _FOURCC = {"MJPEG": "MJPG"}
 _SIZE_PX = (640, 480)
 _HERE = Path(__file__).parent
-_CONTROLS = {"brightness": 90, "contrast": 77, "gain": 60}
+_CONTROLS = {
+    "brightness": 90,
+    "contrast": 77,
+    "gain_automatic": 0,
+    "gain": 60,
+}  # the gain only counts after its automatic
 
 
 def run_all(capture_s: float) -> None:
@@ -60,7 +65,7 @@ def _capture_format(name: str) -> str:
     require(found["size_px"] == list(_SIZE_PX), f"size {found['size_px']}")
     # vivid's colour bars: white on the left, black on the right; a wrong plane or stride shows nothing of the kind.
     bars = found["columns"]
-    require(bars[0] > 150 and bars[-1] < 60, f"no colour bars: mean grey of eighths {bars}")
+    require(bars[0] > 120 and bars[-1] < 60, f"no colour bars: mean grey of eighths {bars}")
     return f"{found['frames']} frames, {found['rate_hz']:.1f}/s, bars {bars[0]:.0f} to {bars[-1]:.0f}"
 
 
@@ -75,7 +80,7 @@ def _controls() -> str:
         if ":" in line
     }
     require(found == _CONTROLS, f"asked {_CONTROLS}, the driver has {found}")
-    run("v4l2-ctl", "-d", node, "--set-ctrl", "brightness=128,contrast=128,gain=100")
+    run("v4l2-ctl", "-d", node, "--set-ctrl", "brightness=128,contrast=128,gain_automatic=1")
     return f"{asked}; read back by v4l2-ctl"
 
 
@@ -84,7 +89,7 @@ def _unknown_control() -> str:
         probe(format="GREY", frames=1, controls="no_such_control=1", limit_s=20)
     except CheckFailedError as error:
         require("no_such_control" in str(error), str(error))
-        return str(error).rpartition(": code")[2][:160]
+        return str(error).rpartition('"reason": ')[2][:120]
     raise CheckFailedError("a control that does not exist was taken")
 
 

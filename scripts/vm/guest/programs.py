@@ -9,6 +9,7 @@ from report import RESULTS, CheckFailedError
 
 VENV = Path("/opt/void-companion")
 PYTHON = str(VENV / "bin/python")
+_KEPT_CHARACTERS = 4000
 COMPANION = str(VENV / "bin/companion")
 
 
@@ -37,7 +38,8 @@ def run(*words: str, limit_s: float = 120.0, codes: tuple[int, ...] = (0,)) -> s
     except subprocess.TimeoutExpired as error:
         raise CheckFailedError(f"{shown}: not done within {limit_s:.0f} s") from error
     with (RESULTS / "programs.log").open("a") as log:
-        log.write(f"$ {shown}\n{done.stdout}{done.stderr}[{done.returncode}]\n")
+        said = done.stdout + done.stderr
+        log.write(f"$ {shown}\n{said[-_KEPT_CHARACTERS:]}[{done.returncode}]\n")
     if done.returncode not in codes:
         said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
         raise CheckFailedError(f"{shown}: code {done.returncode}: {said[-1]}")

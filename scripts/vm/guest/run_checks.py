@@ -9,24 +9,41 @@ from pathlib import Path
 import camera_checks
 import flight_checks
 import machine_checks
+import service_checks
 from report import write
 
 _PLAN = Path(__file__).parent / "plan.json"
+_REBOOTED = Path("/var/lib/vm-check-rebooted")
 
 
 def main() -> None:
-    """Make the checks; whatever becomes of them, switch the machine off."""
-    plan = json.loads(_PLAN.read_text())
-    groups = plan["groups"]
+    """Make the checks; whatever becomes of them, switch the machine off, or boot it again where a check asks for it."""
+    groups = json.loads(_PLAN.read_text())["groups"]
+    next_step = "poweroff"
     try:
-        if machine_checks.prepare():
-            if "cameras" in groups:
-                camera_checks.run_all(plan["capture_s"])
-            if "flight" in groups:
-                flight_checks.run_all()
-        write("finished", "PASS", ", ".join(groups), 0.0)
+        if _REBOOTED.exists():
+            service_checks.after_reboot()
+            write("finished", "PASS", ", ".join(groups), 0.0)
+        elif _first_boot(groups):
+            service_checks.prepare_reboot()
+            _REBOOTED.touch()
+            next_step = "reboot"
+        else:
+            write("finished", "PASS", ", ".join(groups), 0.0)
     finally:
-        subprocess.run(["/usr/bin/systemctl", "poweroff"], check=False)
+        subprocess.run(["/usr/bin/systemctl", next_step], check=False)
+
+
+def _first_boot(groups: list[str]) -> bool:
+    """Make the checks of the first boot; return whether there is something to look at after another one."""
+    capture_s = json.loads(_PLAN.read_text())["capture_s"]
+    if not machine_checks.prepare():
+        return False
+    if "cameras" in groups:
+        camera_checks.run_all(capture_s)
+    if "flight" in groups:
+        flight_checks.run_all()
+    return "service" in groups and service_checks.before_reboot()
 
 
 if __name__ == "__main__":

@@ -11,13 +11,14 @@ from report import CheckFailedError
 
 DRIVER = Path("/sys/bus/platform/drivers/vivid")
 DEVICE = "vivid.0"
+# node_types: bit 0 video capture. input_types: two bits an input, 0 a webcam.
+OPTIONS = ("n_devs=1", "node_types=0x1", "num_inputs=1", "input_types=0x0")
 _NODES = Path("/sys/class/video4linux")
 
 
 def load() -> None:
     """Load the driver with one camera: a webcam input, no tuner, no output, no radio."""
-    # node_types: bit 0 video capture. input_types: two bits an input, 0 a webcam.
-    run("modprobe", "vivid", "n_devs=1", "node_types=0x1", "num_inputs=1", "input_types=0x0")
+    run("modprobe", "vivid", *OPTIONS)
 
 
 def unload() -> None:

@@ -30,7 +30,7 @@ def load_config(path: str | Path) -> Config:
     """Read a configuration file.
 
     Relative paths in it (``source.url`` of a file, ``camera.file``, ``detector.params_file``, ``link.signing_key_file``) are taken as relative
-    to the file's own folder.
+    to the file's own folder. What a ground station has set (``ground_station.parameters_file``) is read after it and wins.
 
     Parameters
     ----------
@@ -43,7 +43,16 @@ def load_config(path: str | Path) -> Config:
         With every fault of the file, one a line.
     """
     path = Path(path)
-    return _resolve_paths(parse_config(read_text(path), name=str(path)), path.absolute().parent)
+    table = parse_table(read_text(path), name=str(path))
+    config = config_of(table, name=str(path))
+    folder = path.absolute().parent
+    named = config.ground_station.parameters_file
+    tuned = folder / (named or f"{path.stem}.tuned.toml")
+    if tuned.exists():
+        over = parse_table(read_text(tuned), name=str(tuned))
+        config = config_of(merged(table, over), name=str(tuned))
+    station = config.ground_station.model_copy(update={"parameters_file": str(tuned)})
+    return _resolve_paths(config.model_copy(update={"ground_station": station}), folder)
 
 
 def parse_config(text: str, *, name: str = "configuration") -> Config:
@@ -54,7 +63,26 @@ def parse_config(text: str, *, name: str = "configuration") -> Config:
     companion.errors.ConfigError
         With every fault of the text, one a line.
     """
-    table = parse_table(text, name=name)
+    return config_of(parse_table(text, name=name), name=name)
+
+
+def merged(table: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables of a configuration with another's keys in place of the same ones of it."""
+    both = dict(table)
+    for key, value in over.items():
+        known = both.get(key)
+        both[key] = {**known, **value} if isinstance(known, dict) and isinstance(value, dict) else value
+    return both
+
+
+def config_of(table: Mapping[str, Any], *, name: str) -> Config:
+    """Return the configuration that a parsed file holds; ``name`` stands in messages for the file.
+
+    Raises
+    ------
+    companion.errors.ConfigError
+        With every fault, one a line.
+    """
     try:
         return Config.model_validate(table)
     except ValidationError as error:
@@ -71,7 +99,7 @@ def default_toml() -> str:
     for section, schema in _section_schemas().items():
         parts.append(f"\n{_comment(schema['description'])}[{section}]\n")
         for key, facts in schema["properties"].items():
-            default = _toml(facts["default"])
+            default = toml_value(facts.get("default", []))
             allowed = allowed_values(facts)
             parts.append(
                 f"\n{_comment(facts['description'])}"
@@ -191,14 +219,14 @@ def _unknown_key_line(loc: tuple[str, ...], table: Mapping[str, Any]) -> str:
 def allowed_values(facts: Mapping[str, Any]) -> str:
     """Return what a key may hold, in words, from its JSON schema (one without references)."""
     if "const" in facts:
-        return f"only {_toml(facts['const'])}"
+        return f"only {toml_value(facts['const'])}"
     if "enum" in facts:
-        return "one of " + ", ".join(_toml(choice) for choice in facts["enum"])
-    if facts["type"] == "boolean":
+        return "one of " + ", ".join(toml_value(choice) for choice in facts["enum"])
+    if facts.get("type") == "boolean":
         return "true or false"
-    if facts["type"] == "string":
+    if facts.get("type", "string") in ("string", "array"):  # no type: text or a list of it
         if examples := facts.get("examples"):
-            return "text such as " + " or ".join(_toml(example) for example in examples)
+            return "text such as " + " or ".join(toml_value(example) for example in examples)
         return "text"
     bounds = [
         f"{word} {facts[bound]:g}"
@@ -225,13 +253,15 @@ def shown_value(value: object) -> str:
     if isinstance(value, list):
         return "a list"
     if isinstance(value, bool | int | float | str):
-        text = _toml(value)
+        text = toml_value(value)
         return text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "..."
     return f"{value} (a date or time)"
 
 
-def _toml(value: bool | float | str) -> str:
+def toml_value(value: bool | float | str | list[str]) -> str:
     """Return one value as TOML writes it."""
+    if isinstance(value, list):
+        return f"[{', '.join(toml_value(item) for item in value)}]"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

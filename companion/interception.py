@@ -9,6 +9,7 @@ from companion.config import Config
 from companion.frames.source import Frame
 from companion.guidance.coordinates import heading_rad, quaternion_from_euler
 from companion.guidance.dialect import Ambiguous, Autopilot, Motion, NotUnderstood, Reading, understand
+from companion.guidance.engagement import Inputs
 from companion.guidance.geodesy import GlobalReference
 from companion.guidance.observation import DetectionReport, Pose
 from companion.guidance.pose_buffer import PoseBuffer
@@ -43,9 +44,11 @@ from companion.mavlink.telemetry import (
     is_offboard,
     vehicle_mode,
 )
+from companion.mavlink.timesync import ClockSync
 from companion.run_statistics import RunStatistics
 
 _HEARTBEAT_LOST_NS: Final = 3_500_000_000
+_ESTIMATOR_KEPT_NS: Final = 5_000_000_000
 _MOST_REFUSALS: Final = 32
 """Senders of forged setpoints that are announced: their ids are the forger's choice."""
 _NEVER_NS: Final = -(1 << 62)
@@ -95,6 +98,9 @@ class Interception:
         self._asked_to_arm_ns = _NEVER_NS
         self._asked_for_offboard_ns = _NEVER_NS
         self._was_ready = False
+        self._off: str | None = None
+        self._faults: dict[str, str] = {}
+        self._estimator: tuple[int, int] | None = None
         self._report_waiting: DetectionReport | None = None
         self._last_report: DetectionReport | None = None
         self._last_verdict: dict[str, Any] = {}
@@ -264,7 +270,7 @@ class Interception:
             self._asked_for_offboard_ns = _NEVER_NS
         armed = self._mode.armed or now_ns - self._asked_to_arm_ns <= _REQUEST_COUNTS_NS
         offboard = self._mode.offboard or now_ns - self._asked_for_offboard_ns <= _REQUEST_COUNTS_NS
-        self.switch.on_vehicle(armed=armed, offboard=offboard, now_ns=now_ns)
+        self.switch.on_vehicle(armed=armed, offboard=offboard, now_ns=now_ns, off=self._off)
         self.announce()
 
     def _on_estimator_reset(self, now_ns: int, why: str) -> None:
@@ -278,6 +284,47 @@ class Interception:
         speed_m_s = self._poses.speed_m_s()
         if pose is not None and speed_m_s is not None:
             self.switch.on_pose(pose, speed_m_s)
+
+    # ------------------------------------------------------------------ from our own component
+
+    @property
+    def armed(self) -> bool:
+        """Whether the autopilot last said that the vehicle is armed."""
+        return self._mode.armed
+
+    def set_config(self, config: Config) -> None:
+        """Take other settings from the next setpoint on; those of links, camera and worker act after a restart."""
+        self._config = config
+        self.switch.set_limits(config.guidance)
+
+    def set_off(self, off: str | None, now_ns: int) -> None:
+        """Take why protection is not wanted; None: it is."""
+        self._off = off
+        if self._autopilot_heartbeat_ns is not None:  # before, an unknown mode is held
+            self._tell_mode(now_ns)
+
+    def on_estimator(self, flags: int, now_ns: int) -> None:
+        """Take ESTIMATOR_STATUS.flags, or those of EKF_STATUS_REPORT."""
+        self._estimator = (flags, now_ns)
+
+    def on_clock(self, sync: ClockSync, now_ns: int) -> None:
+        """Take what the autopilot's clock is against ours: poses are then as old as they are."""
+        self._poses.synchronise(sync.offset_ns, now_ns)
+
+    def inputs(self, now_ns: int) -> Inputs:
+        """Return what is known of everything that protection needs."""
+        seen, switch, camera = self._autopilot_heartbeat_ns, self.switch, self._config.camera
+        pose = "no pose from the autopilot" if switch.pose is None else "pose too old"
+        estimator = self._estimator
+        is_told = estimator is not None and now_ns - estimator[1] <= _ESTIMATOR_KEPT_NS
+        return Inputs(
+            heartbeat_ok=seen is not None and now_ns - seen <= _HEARTBEAT_LOST_NS,
+            pose=None if switch.pose_is_fresh(now_ns) else pose,
+            estimator_flags=estimator[0] if estimator is not None and is_told else None,
+            frames=self._faults.get("camera"),
+            worker=self._faults.get("worker"),
+            camera_model=bool(camera.file) or "hfov_deg" in camera.model_fields_set,
+        )
 
     # ------------------------------------------------------------------ from camera and worker
 
@@ -303,6 +350,10 @@ class Interception:
 
     def set_fault(self, name: str, reason: str | None, now_ns: int) -> None:
         """Tell the switch S of a failing input, or that it works again."""
+        if reason is None:
+            self._faults.pop(name, None)
+        else:
+            self._faults[name] = reason
         self.switch.set_fault(name, reason, now_ns)
 
     # ------------------------------------------------------------------ to the outside
@@ -320,10 +371,13 @@ class Interception:
                 self._log.info("autopilot_heartbeat_back")
 
     def mav_state(self, now_ns: int) -> MavState:
-        """Return what our HEARTBEAT says: BOOT until all inputs were good once, then ACTIVE or CRITICAL."""
+        """Return what our HEARTBEAT says: BOOT until all inputs were good once, then ACTIVE, STANDBY or CRITICAL.
+
+        STANDBY: all is good, and nobody wants protection.
+        """
         if self.switch.not_ready(now_ns) is None and not self._heartbeat_lost:
             self._was_ready = True
-            return MavState.ACTIVE
+            return MavState.ACTIVE if self._off is None else MavState.STANDBY
         return MavState.CRITICAL if self._was_ready else MavState.BOOT
 
     def announce(self) -> None:

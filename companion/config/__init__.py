@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from companion.config.camera import CameraConfig
 from companion.config.detector import DetectorConfig
+from companion.config.engagement import EngagementConfig
+from companion.config.ground_station import GroundStationConfig
 from companion.config.guidance import GuidanceConfig
 from companion.config.link import LinkConfig
 from companion.config.log import LogConfig
@@ -20,6 +22,8 @@ __all__ = [
     "DetectorConfig",
     "Disagreement",
     "DisagreementError",
+    "EngagementConfig",
+    "GroundStationConfig",
     "GuidanceConfig",
     "LinkConfig",
     "LogConfig",
@@ -35,6 +39,8 @@ class Config(Section):
     detector: DetectorConfig = DetectorConfig()
     link: LinkConfig = LinkConfig()
     guidance: GuidanceConfig = GuidanceConfig()
+    engagement: EngagementConfig = EngagementConfig()
+    ground_station: GroundStationConfig = GroundStationConfig()
     log: LogConfig = LogConfig()
 
     def _disagreements(self) -> tuple[Disagreement, ...]:

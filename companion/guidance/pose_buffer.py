@@ -21,6 +21,11 @@ _CLOCK_DRIFT = 200e-6
 """Greatest relative drift of two quartz clocks that the mapping follows."""
 _REBOOT_NS = 1_000_000_000
 """The autopilot's time going back by more than this means that it has restarted."""
+_SYNC_KEPT_NS = 60_000_000_000
+"""A measured offset is used for this long; after that it may be off by more than the link's delay."""
+_MOST_DELAY_NS = 1_000_000_000
+_EARLY_NS = 5_000_000
+"""A measured offset that makes a message arrive this much before it was sent is not that of the time since boot."""
 _JUMP_PREDICTED_S = 1.0
 _KEEP_NS = 3_000_000_000
 _MAX_GAP_NS = 500_000_000
@@ -32,12 +37,30 @@ class BootClock:
 
     A message can be late but never early, so the least difference seen between arrival and boot time
     is the best offset; it is allowed to grow slowly so that it follows the drift between two clocks.
+    That offset is too large by the least delay of the link. An offset measured there and back (TIMESYNC)
+    is not, and is used while it is fresh.
     """
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
         self._last_arrival_ns = 0
         self._last_boot_ns = 0
+        self._synced: tuple[int, int] | None = None
+
+    def synchronise(self, offset_ns: int, now_ns: int) -> bool:
+        """Take a measured offset; return False where it cannot be that of the time since boot.
+
+        Parameters
+        ----------
+        offset_ns
+            Our time less the autopilot's time since boot.
+        now_ns
+            Our time.
+        """
+        if self._offset_ns is None or not -_EARLY_NS <= self._offset_ns - offset_ns <= _MOST_DELAY_NS:
+            return False
+        self._synced = (offset_ns, now_ns)
+        return True
 
     def to_ours_ns(self, time_boot_ms: int, arrival_ns: int) -> tuple[int, bool]:
         """Return our time of a message, and whether the autopilot's clock has restarted.
@@ -54,12 +77,16 @@ class BootClock:
         restarted = self._offset_ns is not None and boot_ns < self._last_boot_ns - _REBOOT_NS
         if self._offset_ns is None or restarted:
             self._offset_ns = sample
+            self._synced = None
         else:
             grown = self._offset_ns + int(_CLOCK_DRIFT * max(0, arrival_ns - self._last_arrival_ns))
             self._offset_ns = min(sample, grown)
         self._last_arrival_ns = arrival_ns
         self._last_boot_ns = boot_ns
-        return boot_ns + self._offset_ns, restarted
+        offset_ns = self._offset_ns
+        if self._synced is not None and arrival_ns - self._synced[1] <= _SYNC_KEPT_NS:
+            offset_ns = min(offset_ns, self._synced[0])  # no message arrives before it was sent
+        return boot_ns + offset_ns, restarted
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +124,10 @@ class PoseBuffer:
         self._clock = BootClock()
         self._positions: deque[_Position] = deque()
         self._attitudes: deque[_Attitude] = deque()
+
+    def synchronise(self, offset_ns: int, now_ns: int) -> bool:
+        """Take our time less the autopilot's time since boot, as TIMESYNC measured it (`BootClock.synchronise`)."""
+        return self._clock.synchronise(offset_ns, now_ns)
 
     def clear(self) -> None:
         """Forget all samples (estimator reset); the clock mapping stays."""

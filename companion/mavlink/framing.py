@@ -38,7 +38,8 @@ INCOMPAT_SIGNED: Final = 0x01
 MAX_FRAME_BYTES: Final = HEADER_V2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 
 CURRENT_MODE: Final = 436
-_NOT_IN_DIALECT: Final = {CURRENT_MODE: 193}
+EKF_STATUS_REPORT: Final = 193
+_NOT_IN_DIALECT: Final = {CURRENT_MODE: 193, EKF_STATUS_REPORT: 71}
 """Messages that are read here and that pymavlink 2.4.50's dialect lacks, with their CRC_EXTRA."""
 
 _CRC_EXTRA: Final[dict[int, bytes]] = {

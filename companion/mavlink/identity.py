@@ -121,11 +121,7 @@ class Identity:
 
     def heartbeat(self, state: MavState) -> None:
         """Send our HEARTBEAT, as an onboard controller, and status texts that waited. Call it once a second."""
-        self._send(
-            mavlink.MAVLink_heartbeat_message(
-                mavlink.MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID, 0, 0, int(state), 3
-            )
-        )
+        self.send(heartbeat_message(state))
         waiting, self._waiting = self._waiting, deque()
         for severity, text in waiting:
             self.status_text(severity, text)
@@ -160,7 +156,7 @@ class Identity:
                 main, sub = _COPTER_BRAKE
             case _:
                 return False
-        self._send(
+        self.send(
             mavlink.MAVLink_command_long_message(
                 self.vehicle.system_id,
                 self.vehicle.component_id,
@@ -191,15 +187,23 @@ class Identity:
             self._text_id = self._text_id % 0xFFFF + 1  # never 0, which means a single chunk
             text_id = self._text_id
         for number, chunk in enumerate(chunks):
-            self._send(mavlink.MAVLink_statustext_message(int(severity), chunk, id=text_id, chunk_seq=number))
+            self.send(mavlink.MAVLink_statustext_message(int(severity), chunk, id=text_id, chunk_seq=number))
 
-    def _send(self, message: mavlink.MAVLink_message) -> None:
+    def send(self, message: mavlink.MAVLink_message) -> None:
+        """Send a message as our own component, to every side."""
         frame = bytes(message.pack(self._encoder))
         self._encoder.seq = (self._encoder.seq + 1) % 256
         if self._signatures is not None:
             frame = self._signatures.sign(frame)
         for endpoint in self._endpoints:
             endpoint.send(frame)
+
+
+def heartbeat_message(state: MavState) -> mavlink.MAVLink_message:
+    """Return our HEARTBEAT: an onboard controller, no autopilot."""
+    return mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID, 0, 0, int(state), 3
+    )
 
 
 def is_autopilot(heartbeat: Heartbeat) -> bool:

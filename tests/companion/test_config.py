@@ -131,7 +131,7 @@ def test_an_integer_does_for_a_float():
         ("[cammera]\nx = 1", "cammera: unknown table; did you mean camera?"),
         (
             "zzz = 1",
-            "zzz: unknown key; allowed here: source, camera, detector, link, guidance, log",
+            "zzz: unknown key; allowed here: source, camera, detector, link, guidance, engagement, ground_station, log",
         ),
         ('[camera]\n"a b" = 70', 'camera."a b": unknown key; allowed here: hfov_deg, file, mount_roll_deg,'),
     ],
@@ -265,4 +265,7 @@ def test_relative_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: py
 
 def test_an_empty_path_stays_empty(tmp_path: Path):
     (tmp_path / "f.toml").write_text("")
-    assert load_config(tmp_path / "f.toml") == Config()
+    config = load_config(tmp_path / "f.toml")
+    tuned = str(tmp_path / "f.tuned.toml")  # what a ground station sets is kept beside it
+    station = Config().ground_station.model_copy(update={"parameters_file": tuned})
+    assert config == Config().model_copy(update={"ground_station": station})

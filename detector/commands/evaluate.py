@@ -56,7 +56,10 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="set of images, see below")
     parser.add_argument(
-        "--method", default="paper", metavar="NAME", help="paper, straight or line_vp (default: %(default)s)"
+        "--method",
+        default="paper",
+        metavar="NAME",
+        help="paper, parallax, straight, flow_balance or line_vp (default: %(default)s)",
     )
     inputs.add_params_arguments(parser)
     parser.add_argument(

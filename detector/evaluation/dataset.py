@@ -34,6 +34,8 @@ _ROTATION_TOLERANCE: Final = 1e-2
 _MIN_FORWARD_SHARE: Final = 0.02
 """Of the baseline: with less of it along the axis the focus of expansion lies next to infinitely far outside."""
 
+_UPRIGHT: Final = math.cos(math.radians(40.0))
+
 _GAP_M: Final = 0.25
 """A partner that lies further than it has to by this much, and by the baseline, stands across a gap in the sequence."""
 
@@ -229,6 +231,26 @@ class ImageSet:
         world_a, world_b = np.array(earlier, np.float64), np.array(later, np.float64)
         moved_m = world_b[:3, 3] - world_a[:3, 3]
         return Motion(world_b[:3, :3].T @ world_a[:3, :3], world_a[:3, :3].T @ moved_m)
+
+    def level_from_later(self, pair: Pair) -> NDArray[np.float64] | None:
+        """Return the rotation (3, 3) from a pair's later camera to a level frame with its z axis down; None where no pose is known.
+
+        Files do not say which way of their world is up. It is taken to be the axis of that world that the cameras' own vertical axes lie nearest to
+        on average; None too where they lie near none (more than 40 degrees).
+        """
+        pose = self.frames[pair.b].pose
+        poses = [frame.pose for frame in self.frames.values() if frame.pose is not None]
+        if pose is None or not poses:
+            return None
+        below = np.mean([np.array(each, np.float64)[:3, 1] for each in poses], axis=0)
+        axis = int(np.argmax(np.abs(below)))
+        if abs(below[axis]) < _UPRIGHT * float(np.linalg.norm(below)):
+            return None
+        down, ahead = np.zeros(3), np.zeros(3)
+        down[axis], ahead[(axis + 1) % 3] = np.sign(below[axis]), 1.0
+        level_from_world = np.stack([ahead, np.cross(down, ahead), down])
+        rotation: NDArray[np.float64] = level_from_world @ np.array(pose, np.float64)[:3, :3]
+        return rotation
 
     def focus_of(self, pair: Pair) -> tuple[float, float] | None:
         """Return the true focus of expansion in a pair's earlier frame: the file's, else that of the poses.

@@ -14,12 +14,18 @@ from detector import lines, vanishing_point
 from detector.camera_model import CameraModel
 from detector.expansion import fit_focus_of_expansion, ideal_px
 from detector.flow import Tracks
+from detector.parallax.flow_field import measure_flow
+from detector.parallax.params import ParallaxParams
+from detector.parallax.pipeline import Intrinsics, ParallaxDetector
 from detector.params import DetectorParams
 from detector.pipeline import VoidDetector
 from detector.results import Detection, Direction, NoDetection
 
 SINGLE_PLANE: Final = "single_plane"
 NONE: Final = "none"
+_BALANCE_FLOW: Final = ParallaxParams(width_px=320)
+_BALANCE_HFOV_DEG: Final = 70.0
+_BALANCE_STILL_PX: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +42,8 @@ class PairInput:
         (3, 3) rotation that takes coordinates of the earlier camera to those of the later one; None where not given.
     translation_earlier_m
         (3,) from the earlier to the later position, in the earlier camera's axes; None where not given.
+    level_from_later
+        (3, 3) rotation from the later camera to a level frame, its z down; None where not given.
     """
 
     earlier: NDArray[np.uint8]
@@ -43,6 +51,7 @@ class PairInput:
     camera: CameraModel | None = None
     later_from_earlier: NDArray[np.float64] | None = None
     translation_earlier_m: NDArray[np.float64] | None = None
+    level_from_later: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +70,8 @@ class Answer:
         Time to contact in steps of the pair's length, from the later frame.
     focus_px
         Focus of expansion in the later frame (without distortion) where the method *estimated* it; None where it was given.
+    confidence
+        In [0, 1], where the method says it.
     tracks
         The flow vectors behind the answer, rotation taken out where it was given. Where the method was told the focus they still say what it would
         have found.
@@ -71,6 +82,7 @@ class Answer:
     reason: str | None = None
     contact_frames: float | None = None
     focus_px: tuple[float, float] | None = None
+    confidence: float | None = None
     tracks: Tracks | None = field(default=None, compare=False, repr=False)
 
 
@@ -127,6 +139,51 @@ class PaperMethod(_Lines):
         self._detector.reset()
 
 
+class ParallaxMethod(_Lines):
+    """The parallax method (:class:`detector.parallax.pipeline.ParallaxDetector`), each pair by itself."""
+
+    def __init__(self, params: DetectorParams) -> None:
+        super().__init__(params)
+        self._detector = ParallaxDetector(frame_params=params)
+
+    def answer(self, pair: PairInput, /) -> Answer:
+        """Return the method's answer. What it says of the focus of expansion is estimated, also where it was told the motion: that is a prior."""
+        result = self._detector.detect(
+            pair.earlier,
+            pair.later,
+            intrinsics=None if pair.camera is None else Intrinsics(pair.camera, "calibration"),
+            later_from_earlier=pair.later_from_earlier,
+            translation_earlier_m=pair.translation_earlier_m,
+            level_from_later=pair.level_from_later,
+        )
+        return answer_of(result.detection, focus_px=result.focus_px)
+
+
+class FlowBalance(_Lines):
+    """Turn away from the side where more moves: the balance of left and right flow, as bees do it (Srinivasan et al. 1996).
+
+    The direction lies off the middle of the image by the share of half its width that (left - right) / (left + right) of the mean flow says.
+    The rotation is taken out where it is given.
+    """
+
+    def answer(self, pair: PairInput, /) -> Answer:
+        """Return the balanced direction."""
+        height_px, width_px = pair.later.shape
+        camera = pair.camera or CameraModel.from_hfov(width_px, height_px, _BALANCE_HFOV_DEG)
+        turn = np.eye(3) if pair.later_from_earlier is None else pair.later_from_earlier
+        field = measure_flow(pair.earlier, pair.later, camera, turn, _BALANCE_FLOW)
+        used = field.where(field.believed)
+        lengths_px = np.linalg.norm(used.later_px - used.earlier_px, axis=1)
+        on_left = used.later_px[:, 0] < 0.5 * (width_px - 1)
+        if not on_left.any() or on_left.all():
+            return Answer(NONE, reason="too_little_flow")
+        left_px, right_px = float(lengths_px[on_left].mean()), float(lengths_px[~on_left].mean())
+        if left_px + right_px < _BALANCE_STILL_PX:
+            return Answer(NONE, reason="no_motion")
+        offset = (left_px - right_px) / (left_px + right_px)
+        return Answer("flow_balance", (0.5 * (width_px - 1) * (1.0 + offset), 0.5 * (height_px - 1)))
+
+
 class StraightAhead(_Lines):
     """Always the middle of the image: what a camera that is pointed where one wants to go would say."""
 
@@ -146,7 +203,13 @@ class LineVanishingPoint(_Lines):
 
 
 METHODS: Final[Mapping[str, Callable[[DetectorParams], Method]]] = MappingProxyType(
-    {"paper": PaperMethod, "straight": StraightAhead, "line_vp": LineVanishingPoint}
+    {
+        "paper": PaperMethod,
+        "parallax": ParallaxMethod,
+        "straight": StraightAhead,
+        "flow_balance": FlowBalance,
+        "line_vp": LineVanishingPoint,
+    }
 )
 """What ``--method`` can name."""
 
@@ -161,8 +224,8 @@ def answer_of(
     frames = None if contact is None else contact.frames
     if isinstance(detection, Direction):
         point_px = (detection.x_px, detection.y_px)
-        return Answer(detection.kind.value, point_px, None, frames, focus_px, tracks)
-    return Answer(SINGLE_PLANE, None, None, frames, focus_px, tracks)
+        return Answer(detection.kind.value, point_px, None, frames, focus_px, detection.confidence, tracks)
+    return Answer(SINGLE_PLANE, None, None, frames, focus_px, detection.confidence, tracks)
 
 
 def with_focus(answer: Answer, camera: CameraModel | None) -> Answer:

@@ -226,14 +226,19 @@ def _judge_pair(
     turned_back = pair.b_derot if settings.derotated else None
     earlier, later = reader.read(pair.a), reader.read(pair.b if turned_back is None else turned_back)
     motion = images.motion_of(pair)
-    rotation = translation_m = None
+    rotation = translation_m = level = None
     if motion is not None and images.camera is not None and settings.poses != "none":
         rotation = np.eye(3) if settings.derotated else motion.later_from_earlier
         translation_m = motion.translation_earlier_m if settings.poses == "full" else None
+        level = images.level_from_later(pair)
+        if settings.derotated and level is not None:
+            level = (
+                level @ motion.later_from_earlier
+            )  # the later picture was turned into the earlier orientation
     if not settings.sequence:
         method.reset()
     begin = timer()
-    answer = method.answer(PairInput(earlier, later, images.camera, rotation, translation_m))
+    answer = method.answer(PairInput(earlier, later, images.camera, rotation, translation_m, level))
     seconds = timer() - begin
     frame_a, frame_b = images.frames[pair.a], images.frames[pair.b]
     scene = Scene(

@@ -11,7 +11,7 @@ Without a prior for the direction, several starts and an essential matrix (MAGSA
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
@@ -179,6 +179,30 @@ def estimate_egomotion(
     return _result(problem, state, field, attitude_given=attitude_given)
 
 
+def cost_of_motion(
+    field: FlowField, params: ParallaxParams, start: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> tuple[float, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the robust cost of the motion that explains a field best, near a start, without any prior.
+
+    What the focal length does to it is how that can be estimated (:mod:`detector.parallax.focal`).
+
+    Parameters
+    ----------
+    field
+        Its believed samples are used; its camera is the one that is tried.
+    params
+        Settings.
+    start
+        Rotation (3, 3) and direction of travel (3,), as the result has them.
+    """
+    used = field.where(field.believed)
+    problem = replace(
+        _Problem.of(used, params, attitude_given=False, direction_prior=None), rotation_sigma_rad=math.inf
+    )
+    state = _minimised(problem, _State(*start), _ROUNDS)
+    return problem.cost(state), (state.rotation, state.direction)
+
+
 def focus_of_expansion(motion: Egomotion, camera: CameraModel) -> FocusOfExpansion | None:
     """Return the focus of expansion with its uncertainty; None where the motion is sideways or backwards, and there is none.
 
@@ -255,31 +279,30 @@ class _Problem:
         if len(self.start) <= most:
             return self
         kept = np.linspace(0, len(self.start) - 1, most).astype(np.intp)
-        return _Problem(
-            self.start[kept],
-            self.end[kept],
-            self.covariance[kept],
-            self.focal_px,
-            self.cauchy,
-            self.share * len(self.start) / most,
-            self.rotation_sigma_rad,
-            self.direction_prior,
-            self.direction_sigma_rad,
+        return replace(
+            self,
+            start=self.start[kept],
+            end=self.end[kept],
+            covariance=self.covariance[kept],
+            share=self.share * len(self.start) / most,
         )
 
     def residuals(self, state: _State, *, slopes: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the whitened distances from the epipolar lines (N,) and, if asked, their slopes (N, 5)."""
         turned = self.start @ state.rotation.T
-        line = np.cross(state.direction, turned)
+        skew = _skew(state.direction)
         # The later point lies on the grid, exactly; the noise is the earlier point's, across its own epipolar line. So this is its distance itself.
-        normal = (np.cross(self.end, state.direction) @ state.rotation)[:, :2]
-        spread = np.einsum("ni,nij,nj->n", normal, self.covariance, normal)
+        across = self.end @ skew  # end x direction
+        normal = across @ state.rotation
+        u, v = normal[:, 0], normal[:, 1]
+        spread = u * u * self.covariance[:, 0, 0] + v * v * self.covariance[:, 1, 1]
+        spread += 2.0 * u * v * self.covariance[:, 0, 1]
         scale = self.focal_px / np.sqrt(np.maximum(spread, 1e-15))
-        residual = np.einsum("ni,ni->n", self.end, line) * scale
+        residual = np.einsum("ni,ni->n", across, turned) * scale
         if not slopes:
             return residual, np.zeros((0, 5))
-        by_rotation = np.cross(turned, np.cross(self.end, state.direction))
-        by_direction = np.cross(turned, self.end) @ _tangent(state.direction)
+        by_rotation = _cross(turned, across)
+        by_direction = _cross(turned, self.end) @ _tangent(state.direction)
         return residual, np.hstack([by_rotation, by_direction]) * scale[:, None]
 
     def cost(self, state: _State) -> float:
@@ -410,6 +433,19 @@ def _as_given(field: FlowField, params: ParallaxParams, direction: NDArray[np.fl
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     unit: NDArray[np.float64] = np.asarray(vector, np.float64) / np.linalg.norm(vector)
     return unit
+
+
+def _skew(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (3, 3) matrix S with rows @ S = rows x vector, and S @ column = vector x column."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return row by row cross products, (N, 3), without the generality of numpy's."""
+    a, b, c = first.T
+    x, y, z = second.T
+    return np.column_stack([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
 def _tangent(direction: NDArray[np.float64]) -> NDArray[np.float64]:

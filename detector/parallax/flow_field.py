@@ -23,6 +23,9 @@ _LK_WINDOW_PX: Final = 11
 _LK_CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 6, 0.02)
 _LK_MOST_PX: Final = 1.5
 """Lucas-Kanade refines; where it goes farther than this it went astray."""
+_SCHARR_NOISE: Final = 236.0 / 32.0**2
+"""Variance of a Scharr gradient (scaled to grey values a pixel) over that of the pixels."""
+_NOISE_KERNEL: Final = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _COARSE_WIDTH_PX: Final = 320
 _COARSE_STEP_PX: Final = 6
 _COARSE_ROUNDS: Final = 2
@@ -109,16 +112,20 @@ def measure_flow(
     forth = np.asarray(search.calc(turned, now, None), np.float32)  # type: ignore[call-overload]
     at = _grid(size, params.step_px)
     column, row = at.T.astype(np.intp)
-    found = (at + back[row, column]).astype(np.float32)
-    found = _refined(now, turned, at, found)
-    home = cv2.remap(forth, found[:, None, 0], found[:, None, 1], cv2.INTER_LINEAR).reshape(-1, 2)
-    inside = cv2.remap(seen, found[:, None, 0], found[:, None, 1], cv2.INTER_NEAREST, borderValue=0.0)
-
-    information, strongest = _information(now, column, row, params)
-    missed = (found - at + home).astype(np.float64)
-    limit = (params.round_trip_px / params.flow_sigma_px) ** 2
-    returned = np.einsum("ni,nij,nj->n", missed, information, missed) < limit
+    information, strongest = _information(now, column, row, grey_noise(now), params)
     textured = strongest > 1.0 / params.informative_sigma_px**2
+    found = (at + back[row, column]).astype(np.float32)
+    believed = np.zeros(len(at), np.bool_)
+    if textured.any():
+        # Where there is no texture there is nothing to refine, and nothing to believe.
+        seeds, ends = at[textured], _refined(now, turned, at[textured], found[textured])
+        found[textured] = ends
+        home = cv2.remap(forth, ends[:, None, 0], ends[:, None, 1], cv2.INTER_LINEAR).reshape(-1, 2)
+        inside = cv2.remap(seen, ends[:, None, 0], ends[:, None, 1], cv2.INTER_NEAREST, borderValue=0.0)
+        missed = (ends - seeds + home).astype(np.float64)
+        limit = (params.round_trip_px / params.flow_sigma_px) ** 2
+        returned = np.einsum("ni,nij,nj->n", missed, information[textured], missed) < limit
+        believed[textured] = returned & (inside.reshape(-1) > 0)
     offset = 0.5 * (reduction - 1)
     return FlowField(
         later_px=at.astype(np.float64) * reduction + offset,
@@ -126,7 +133,7 @@ def measure_flow(
         information=information / reduction**2,
         later_from_earlier=np.asarray(turn, np.float64),
         textured=textured,
-        believed=textured & returned & (inside.reshape(-1) > 0),
+        believed=believed,
         camera=camera,
     )
 
@@ -217,7 +224,11 @@ def _refined(
 
 
 def _information(
-    image: NDArray[np.uint8], column: NDArray[np.intp], row: NDArray[np.intp], params: ParallaxParams
+    image: NDArray[np.uint8],
+    column: NDArray[np.intp],
+    row: NDArray[np.intp],
+    noise_grey: float,
+    params: ParallaxParams,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the (N, 2, 2) information about the flow, and the larger eigenvalue (N,) of it before noise that no texture removes is added.
 
@@ -230,8 +241,11 @@ def _information(
         np.asarray(cv2.boxFilter(product, cv2.CV_32F, window, normalize=False), np.float64)[row, column]
         for product in (d_x * d_x, d_x * d_y, d_y * d_y)
     )
+    # Noise has gradients too, the same in all directions: what is left without them is texture.
+    noise = _LK_WINDOW_PX**2 * _SCHARR_NOISE * noise_grey**2
+    xx, xy, yy = _without(xx, xy, yy, params.noise_factor * noise)
     # Neighbouring pixels are not independent (the lens, the sensor's interpolation): a quarter of them are.
-    scale = 0.25 / (2.0 * params.grey_sigma**2)
+    scale = 0.25 / (2.0 * max(params.grey_sigma, noise_grey) ** 2)
     loose = 1.0 / params.loose_sigma_px**2
     a, b, c = xx * scale + loose, xy * scale, yy * scale + loose
     strongest = 0.5 * (a + c) + np.sqrt(0.25 * (a - c) ** 2 + b**2)
@@ -244,6 +258,27 @@ def _information(
     information[:, 1, 1] = (c + floor * t_determinant) / determinant
     information[:, 0, 1] = information[:, 1, 0] = b / determinant
     return information, strongest
+
+
+def _without(
+    xx: NDArray[np.float64], xy: NDArray[np.float64], yy: NDArray[np.float64], noise: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return structure tensors less the noise's share of both eigenvalues, which stay at 0 or above."""
+    mean, half, root = 0.5 * (xx + yy), 0.5 * (xx - yy), np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    large, small = np.maximum(mean + root - noise, 0.0), np.maximum(mean - root - noise, 0.0)
+    stretch = np.divide(0.5 * (large - small), root, out=np.zeros_like(root), where=root > 0.0)
+    middle = 0.5 * (large + small)
+    return middle + stretch * half, stretch * xy, middle - stretch * half
+
+
+def grey_noise(image: NDArray[np.uint8]) -> float:
+    """Return the standard deviation of the noise, in grey values.
+
+    From the median size of a difference of Laplacians (Immerkaer 1996), which a plane surface and a straight ramp leave at zero; every second pixel of
+    every second row tells enough.
+    """
+    response = cv2.filter2D(image, cv2.CV_16S, _NOISE_KERNEL)[::2, ::2]
+    return float(np.median(np.abs(response))) / (0.6745 * 6.0)
 
 
 def _grid(size: tuple[int, int], step_px: int) -> NDArray[np.float32]:

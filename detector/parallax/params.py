@@ -47,6 +47,14 @@ class ParallaxParams(BaseModel):
             description="Noise of grey values between the frames. Larger: more texture is needed for a sample to count.",
         ),
     ] = 3.0
+    noise_factor: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=5,
+            description="How many times the gradients of the picture's own noise are taken off its texture. Larger: more texture is needed.",
+        ),
+    ] = 1.5
     loose_sigma_px: Annotated[
         float,
         Field(
@@ -62,7 +70,7 @@ class ParallaxParams(BaseModel):
             le=10,
             description="A sample says something of its range where its flow along the epipolar line is known this well. Larger: weaker texture counts.",
         ),
-    ] = 0.6
+    ] = 0.5
     least_informative: Annotated[
         int,
         Field(
@@ -129,6 +137,24 @@ class ParallaxParams(BaseModel):
         ),
     ] = 3.0
 
+    # ------------------------------------------------------------------ scale
+    least_baseline_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=5,
+            description="A given motion of at least this counts: then no parallax means far away, and not standing still.",
+        ),
+    ] = 0.05
+    assumed_baseline_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=5,
+            description="Where the baseline is not known, the vehicle's size is swept as if it were this. Larger: narrower ways count as free.",
+        ),
+    ] = 0.2
+
     # ------------------------------------------------------------------ without calibration
     assumed_hfov_deg: Annotated[
         float,
@@ -136,3 +162,18 @@ class ParallaxParams(BaseModel):
             gt=20, lt=150, description="Horizontal field of view where neither it nor a calibration is known."
         ),
     ] = 70.0
+    focal_pairs: Annotated[
+        int,
+        Field(ge=1, le=200, description="Pairs that the focal length is estimated from; the newest ones."),
+    ] = 15
+    focal_least_pairs: Annotated[
+        int, Field(ge=1, le=200, description="With fewer pairs it is not estimated. Larger: later, surer.")
+    ] = 8
+    focal_most_sigma: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=1,
+            description="An estimate less sure than this share of itself is refused. Larger: laxer.",
+        ),
+    ] = 0.12

@@ -6,20 +6,26 @@ upright edge seen by a camera that climbs says nothing, and must not read as "in
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from detector.camera_model import CameraModel
 from detector.parallax.egomotion import Egomotion, plane_points
 from detector.parallax.flow_field import FlowField
 from detector.parallax.params import ParallaxParams
 from detector.parallax.samples import RangedSamples
 from detector.results import TimeToContact
+from detector.rotation import rotation_matrix
 
 CAMERA_LEVEL: Final = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """Level frame from camera axes where the attitude is not known: the camera is taken to be level."""
+
+_HORIZON_MARGIN_RAD: Final = math.radians(5.0)
+"""Less than this of the picture beyond the horizon, and flight height is not seen."""
 
 _OFF_LINE_SIGMAS: Final = 4.0
 _BACKWARDS_SIGMAS: Final = 3.0
@@ -36,8 +42,6 @@ class InverseDepths:
 
     Attributes
     ----------
-    samples
-        Of the field, (N,) indices that are told below.
     rays
         (N, 3) unit vectors in the later camera's axes.
     inverse_range
@@ -117,9 +121,9 @@ def inverse_depths(field: FlowField, motion: Egomotion, params: ParallaxParams) 
 
 
 def ranged_samples(
-    depths: InverseDepths, *, baseline_m: float | None, level_from_later: NDArray[np.float64] | None
+    depths: InverseDepths, *, baseline_m: float | None, frame_from_later: NDArray[np.float64]
 ) -> RangedSamples:
-    """Return the samples in the level frame, in metres where the baseline is known.
+    """Return the samples in the frame that they are swept in, in metres where the baseline is known.
 
     Parameters
     ----------
@@ -127,19 +131,48 @@ def ranged_samples(
         From :func:`inverse_depths`.
     baseline_m
         Between the two camera positions.
-    level_from_later
-        (3, 3) rotation from the later camera's axes to the level frame, its z down; None takes the camera to be level.
+    frame_from_later
+        (3, 3) rotation from the later camera's axes, as :func:`flight_frame` returns it.
     """
-    rotation = np.array(CAMERA_LEVEL) if level_from_later is None else level_from_later
     scale = 1.0 if baseline_m is None else 1.0 / baseline_m
     return RangedSamples(
-        rays_level=depths.rays @ rotation.T,
+        rays_level=depths.rays @ frame_from_later.T,
         inverse_range=depths.inverse_range * scale,
         sigma=depths.sigma * scale,
         pixels_px=depths.pixels_px,
         metric=baseline_m is not None,
         informative=depths.informative,
     )
+
+
+def flight_frame(
+    level_from_later: NDArray[np.float64] | None, camera: CameraModel
+) -> tuple[NDArray[np.float64], bool]:
+    """Return the frame that ranges are swept in, (3, 3) from the later camera's axes, and whether it is level.
+
+    It is the level frame, as long as the picture holds the horizon. A camera that looks down (or up) past it sees nothing of what lies at flight height;
+    then the frame is tipped forward until the optical axis lies in it, so that what is swept is what is seen. Floors count as obstacles there: that errs
+    on the careful side.
+
+    Parameters
+    ----------
+    level_from_later
+        (3, 3) of the level frame; None takes the camera to be level.
+    camera
+        For its field of view.
+    """
+    if level_from_later is None:
+        return np.array(CAMERA_LEVEL), False
+    axis = level_from_later[:, 2]
+    tilt_rad = math.asin(max(-1.0, min(1.0, float(axis[2]))))
+    if abs(tilt_rad) <= 0.5 * camera.vfov_rad - _HORIZON_MARGIN_RAD:
+        return level_from_later, True
+    across = np.array([-axis[1], axis[0], 0.0])
+    size = float(np.linalg.norm(across))
+    if size < 1e-6:
+        return np.array(CAMERA_LEVEL), False
+    # About the axis to the right a positive angle lifts the view: what was the optical axis becomes level.
+    return rotation_matrix(across / size * tilt_rad) @ level_from_later, False
 
 
 def contact_about(

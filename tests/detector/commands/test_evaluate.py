@@ -209,7 +209,10 @@ def test_a_grid_of_positions_has_answers_and_no_truth(capsys, tmp_path):
         (["{missing}"], "is not a folder"),
         (["{empty}"], "holds neither groundtruth.json nor poses.json"),
         (["{broken}"], "is not valid JSON"),
-        (["{office}", "--method", "best"], "--method: found 'best', allowed are paper, straight, line_vp"),
+        (
+            ["{office}", "--method", "best"],
+            "--method: found 'best', allowed are paper, parallax, straight, flow_balance, line_vp",
+        ),
         (["{office}", "--preset", "best"], "preset: found 'best'"),
         (["{office}", "--derotated"], "has no b_derot"),
         (["{bricks}", "--min-baseline", "0.2"], "needs the pose of every frame"),

@@ -109,6 +109,7 @@ class Own:
                 streams=self._intervals,
             ),
             produce=self._produce,
+            engagement=config.engagement,
             timesync_interval_ns=round(1e9 / rate_hz) if rate_hz else 0,
             signatures=signatures,
         )

@@ -6,7 +6,9 @@ message                           what becomes of it
 PARAM_*, COMMAND_LONG/INT to us   answered to both sides, and not passed on
 PARAM_REQUEST_LIST to everybody   answered, and passed on
 TIMESYNC answer to our question   taken, and not passed on: others would take it for an answer to theirs
+COMMAND_ACK to us                 taken: the answer to a stream that we asked for
 RC_CHANNELS, ESTIMATOR_STATUS     of the autopilot: read, and passed on
+what we need a rate of            counted, and passed on; asked for where it does not come (``streams``)
 ================================  ========================================================================
 
 Others' TIMESYNC questions are theirs: two clocks that answer would tear the autopilot's between them.
@@ -20,27 +22,41 @@ from typing import Final, Protocol
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.mavlink import commands, parameters
+from companion.config import EngagementConfig
+from companion.mavlink import commands, parameters, streams
 from companion.mavlink.commands import CommandServer
 from companion.mavlink.framing import EKF_STATUS_REPORT, RawFrame
 from companion.mavlink.identity import MavSeverity
 from companion.mavlink.parameters import ParameterServer
 from companion.mavlink.signing import Signatures
+from companion.mavlink.streams import ESTIMATOR_STATUS, RC_CHANNELS, StreamRequests
 from companion.mavlink.telemetry import Heartbeat
 from companion.mavlink.timesync import ClockSync, TimeSync
 
 TIMESYNC: Final = 111
-RC_CHANNELS: Final = 65
-ESTIMATOR_STATUS: Final = 230
+
+COMMAND_ACK: Final = 77
 
 _REQUESTS: Final = parameters.MESSAGE_IDS | commands.MESSAGE_IDS
-_OF_AUTOPILOT: Final = frozenset({TIMESYNC, RC_CHANNELS, ESTIMATOR_STATUS, EKF_STATUS_REPORT})
+_COUNTED: Final = frozenset(
+    {
+        streams.LOCAL_POSITION_NED,
+        streams.ATTITUDE,
+        streams.ATTITUDE_QUATERNION,
+        streams.GLOBAL_POSITION_INT,
+        streams.RC_CHANNELS,
+        streams.ESTIMATOR_STATUS,
+        EKF_STATUS_REPORT,
+    }
+)
+_OF_AUTOPILOT: Final = frozenset({TIMESYNC, COMMAND_ACK}) | _COUNTED
 MESSAGE_IDS: Final = _REQUESTS | _OF_AUTOPILOT
 """What `OwnComponent.takes` looks at."""
 
 _TIMESYNC: Final = struct.Struct("<qq")
 _RC_CHANNELS: Final = struct.Struct("<I18HBB")
 _FLAGS_AT: Final = {ESTIMATOR_STATUS: 40, EKF_STATUS_REPORT: 20}
+_ACK: Final = struct.Struct("<HBBiBB")
 _FLAGS: Final = struct.Struct("<H")
 _AUTOPILOT_COMPONENT: Final = 1
 _REFUSED_TEXT: Final = "unsigned or wrongly signed request refused"
@@ -99,6 +115,8 @@ class OwnComponent:
         What answers requests.
     produce
         Returns what is to be sent by itself now (plots, computer status).
+    engagement
+        Says which streams are needed.
     timesync_interval_ns
         How often the clock is asked for; 0: never.
     signatures
@@ -115,6 +133,7 @@ class OwnComponent:
         parameter_server: ParameterServer,
         command_server: CommandServer,
         produce: Callable[[int], list[mavlink.MAVLink_message]],
+        engagement: EngagementConfig,
         timesync_interval_ns: int,
         signatures: Signatures | None = None,
     ) -> None:
@@ -125,6 +144,8 @@ class OwnComponent:
         self._produce = produce
         self._timesync = TimeSync()
         self._timesync_interval_ns = timesync_interval_ns
+        self._engagement = engagement
+        self._streams = StreamRequests()
         self._asked_ns = -(1 << 62)
         self._signatures = signatures
         self.refused_requests = 0
@@ -141,13 +162,18 @@ class OwnComponent:
         if not from_autopilot or not self._is_vehicles(frame):
             return False
         payload = frame.payload
+        if frame.message_id in _COUNTED:
+            self._streams.count(frame.message_id)
         match frame.message_id:
             case _ if frame.message_id == TIMESYNC:
                 return self._clock(payload, now_ns)
+            case _ if frame.message_id == COMMAND_ACK:
+                ours = (self._speaker.system_id, self._speaker.component_id)
+                return _ACK.unpack(payload.ljust(_ACK.size, b"\0")[: _ACK.size])[-2:] == ours
             case _ if frame.message_id == RC_CHANNELS:
                 values = _RC_CHANNELS.unpack(payload.ljust(_RC_CHANNELS.size, b"\0")[: _RC_CHANNELS.size])
                 self._listener.on_rc_channels(values[1 : 1 + min(18, values[19])], now_ns)
-            case message_id:
+            case message_id if message_id in _FLAGS_AT:
                 at = _FLAGS_AT[message_id]
                 self._listener.on_estimator(_FLAGS.unpack_from(payload.ljust(at + 2, b"\0"), at)[0], now_ns)
         return False
@@ -159,6 +185,12 @@ class OwnComponent:
         if self._timesync_interval_ns and now_ns - self._asked_ns >= self._timesync_interval_ns:
             self._asked_ns = now_ns
             self._speaker.send(mavlink.MAVLink_timesync_message(0, self._timesync.ask(now_ns)))
+        vehicle = self._speaker.vehicle
+        if vehicle is not None:
+            for message_id, interval_us in self._streams.due(
+                streams.needs(vehicle.autopilot, self._engagement), now_ns
+            ):
+                self._speaker.send(streams.request(vehicle, message_id, interval_us))
         for message in self._produce(now_ns):
             self._speaker.send(message)
 

@@ -1,4 +1,4 @@
-"""Command line of the companion service: ``companion run | config | check-config | demo | sim | cameras``."""
+"""Command line of the companion service: ``companion run | config | check-config | demo | sim | cameras | calibrate``."""
 
 from __future__ import annotations
 
@@ -64,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     # Their command lines are their own (``_OWN_PARSERS``); here they are for the list of commands.
     commands.add_parser("sim", help="fly closed loop in a simulated indoor world", add_help=False)
     commands.add_parser("cameras", help="list cameras, take a picture, measure their timing", add_help=False)
+    commands.add_parser("calibrate", help="make or judge a camera file with a board", add_help=False)
     return parser
 
 
@@ -79,9 +80,16 @@ def _cameras_parser() -> argparse.ArgumentParser:
     return cameras_parser()
 
 
+def _calibrate_parser() -> argparse.ArgumentParser:
+    from companion.calibrate.command import calibrate_parser
+
+    return calibrate_parser()
+
+
 _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
     "sim": _sim_parser,
     "cameras": _cameras_parser,
+    "calibrate": _calibrate_parser,
 }
 """Commands whose modules import much that nothing else needs."""
 

@@ -1,0 +1,1 @@
+"""Calibration of a camera with a board: views, solution, judgement, camera file, picture of the coverage."""

@@ -7,6 +7,8 @@ frames         camera     takes the newest frame, looks up the pose at its time,
 vision         events     owns the worker process: start, deadline, restart (``vision.supervisor``)
 health         10 Hz      judges inputs, tells the switch S of failures, announces changes of state
 heartbeat      1 Hz       our HEARTBEAT, only while health has run
+component      10 Hz      our own component: answers that wait, TIMESYNC, plots, the computer's status
+settings       events     writes what a ground station has set to its file
 status         config     one line with all rates and ages
 systemd        1 Hz       feeds its watchdog, only while health has run; where it started us
 =============  =========  ==============================================================================
@@ -17,7 +19,7 @@ Setpoints have no loop: they are decided and sent in the call that received them
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack
 from functools import partial
 from typing import Any, Final
@@ -31,14 +33,18 @@ from companion.frames.source import FrameSource
 from companion.guidance.observation import DetectionReport
 from companion.interception import Interception
 from companion.log import Log
+from companion.mavlink.endpoint import Endpoint
+from companion.mavlink.endpoints import make_side
 from companion.mavlink.identity import Identity
-from companion.mavlink.link import UdpEndpoint
+from companion.mavlink.network import Side
 from companion.mavlink.proxy import InlineProxy
 from companion.mavlink.signing import open_signatures
+from companion.own import Own
 from companion.systemd import ServiceNotifier
 from companion.vision.supervisor import VisionSupervisor
 
 _HEALTH_PERIOD_NS: Final = 100_000_000
+_COMPONENT_PERIOD_NS: Final = 100_000_000
 _HEARTBEAT_PERIOD_NS: Final = 1_000_000_000
 _HEALTH_LATE_NS: Final = 1_000_000_000
 """Health that has not run for this long means that this process does not work: no HEARTBEAT then."""
@@ -77,7 +83,7 @@ class Service:
         self._clock = clock
         self._log = log
         self._open_frames = open_frames or partial(open_source, config.source, clock=clock, log=log)
-        self._links: tuple[UdpEndpoint, ...] = ()
+        self._links: tuple[Endpoint, ...] = ()
         self._stop = asyncio.Event()
         self._notifier = notifier if notifier is not None else ServiceNotifier(None)
         self._health_ns = clock.now_ns()
@@ -88,8 +94,8 @@ class Service:
         self._report_failure = ""
 
     @property
-    def links(self) -> tuple[UdpEndpoint, ...]:
-        """Both sides while it runs, the planner's first; empty before."""
+    def links(self) -> tuple[Endpoint, ...]:
+        """The links of both sides while it runs, the planner's first; empty before."""
         return self._links
 
     def stop(self) -> None:
@@ -106,21 +112,39 @@ class Service:
         """
         config, clock, log = self._config, self._clock, self._log
         async with AsyncExitStack() as stack:
-            planner = UdpEndpoint(config.link.planner, name="link.planner", now_ns=clock.now_ns)
-            autopilot = UdpEndpoint(config.link.autopilot, name="link.autopilot", now_ns=clock.now_ns)
-            await stack.enter_async_context(planner)
-            await stack.enter_async_context(autopilot)
-            self._links = (planner, autopilot)
+            planner = make_side("planner", config.link.planner_urls, now_ns=clock.now_ns)
+            autopilot = make_side("autopilot", config.link.autopilot_urls, now_ns=clock.now_ns)
+            for link in (*planner, *autopilot):
+                link.on_state = self._on_link_state
+                await stack.enter_async_context(link)
+            self._links = (*planner, *autopilot)
             signatures = open_signatures(config.link)
             identity = Identity(
-                planner,
-                autopilot,
+                Side(planner),
+                Side(autopilot),
                 component_id=config.link.component_id,
                 now_ns=clock.now_ns,
                 signatures=signatures,
             )
             flight = Interception(config, identity=identity, log=log)
-            proxy = InlineProxy(planner, autopilot, flight, now_ns=clock.now_ns, signatures=signatures)
+            own = Own(
+                config,
+                flight,
+                identity,
+                log=log,
+                now_ns=clock.now_ns(),
+                apply=self._apply,
+                signatures=signatures,
+            )
+            proxy = InlineProxy(
+                planner,
+                autopilot,
+                flight,
+                now_ns=clock.now_ns,
+                signatures=signatures,
+                own=own.component,
+                filters=config.link.filter_rules,
+            )
 
             def on_report(report: DetectionReport) -> None:
                 self._take_report(flight, report)
@@ -133,14 +157,16 @@ class Service:
                 "vision": vision.run(),
                 "health": self._health(flight, vision),
                 "heartbeat": self._heartbeat(flight, identity),
-                "status": self._status(flight, vision, proxy),
+                "component": self._component(own),
+                "settings": own.settings.keep(own.complain),
+                "status": self._status(flight, vision, proxy, own),
             }
             if self._notifier.enabled:
                 loops["systemd"] = self._tell_systemd(flight)
             log.info(
                 "service_started",
-                planner=_listening(planner),
-                autopilot=_listening(autopilot),
+                planner=_labels(planner),
+                autopilot=_labels(autopilot),
                 source=config.source.shown_url,
                 preset=config.detector.preset,
             )
@@ -155,6 +181,10 @@ class Service:
                 log.info("summary", **flight.statistics.summary(), **proxy.counters.as_dict())
                 log.info("service_stopped")
 
+    def _apply(self, config: Config) -> None:
+        """Take settings that were changed in flight."""
+        self._config = config
+
     def _take_report(self, flight: Interception, report: DetectionReport) -> None:
         """Hand on a report. What fails there must not end the process in flight: to the switch S vision is silent."""
         try:
@@ -163,6 +193,12 @@ class Service:
             if repr(error) != self._report_failure:  # once, not at the rate of the frames
                 self._report_failure = repr(error)
                 self._log.exception("report_failed", frame_seq=report.frame_seq)
+
+    def _on_link_state(self, link: Endpoint) -> None:
+        if link.state.startswith("waiting"):
+            self._log.warning("link_state", link=link.name, url=link.label, state=link.state)
+        else:
+            self._log.info("link_state", link=link.name, url=link.label, state=link.state)
 
     # ------------------------------------------------------------------ loops
 
@@ -200,10 +236,11 @@ class Service:
 
     async def _health(self, flight: Interception, vision: VisionSupervisor) -> None:
         """Judge every input ten times a second."""
-        clock, config = self._clock, self._config
+        clock = self._clock
         started_ns = clock.now_ns()
         while True:
             now_ns = clock.now_ns()
+            config = self._config  # may change in flight
             camera = self._source_fault
             if camera is None and self._last_frame_ns is not None:
                 floor_hz = config.source.min_rate_hz * (_RATE_BACK if self._too_slow else 1.0)
@@ -244,7 +281,16 @@ class Service:
                 notifier.working(f"{status['state']}: {status['reason']}; frames {status['frames_hz']}/s")
             await self._clock.sleep_until_ns(now_ns + notifier.period_ns)
 
-    async def _status(self, flight: Interception, vision: VisionSupervisor, proxy: InlineProxy) -> None:
+    async def _component(self, own: Own) -> None:
+        """Let our own component send what is due."""
+        while True:
+            now_ns = self._clock.now_ns()
+            own.component.tick(now_ns)
+            await self._clock.sleep_until_ns(now_ns + _COMPONENT_PERIOD_NS)
+
+    async def _status(
+        self, flight: Interception, vision: VisionSupervisor, proxy: InlineProxy, own: Own
+    ) -> None:
         """Write the status line."""
         interval_s = self._config.log.status_interval_s
         if interval_s == 0:
@@ -254,12 +300,13 @@ class Service:
             self._log.info(
                 "status",
                 **flight.status(self._clock.now_ns()),
+                **own.status(self._clock.now_ns()),
                 worker=vision.status.state,
                 worker_restarts=vision.status.restarts,
+                links={link.name: link.status() for link in self._links},
                 **proxy.counters.as_dict(),
             )
 
 
-def _listening(endpoint: UdpEndpoint) -> str:
-    host, port = endpoint.local_address
-    return f"{host}:{port}"
+def _labels(links: Sequence[Endpoint]) -> str:
+    return ", ".join(link.label for link in links)

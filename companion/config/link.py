@@ -4,40 +4,59 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import BeforeValidator, Field
 
+from companion.config.endpoint_url import parse_endpoint_url
+from companion.config.link_filter import FilterRule, parse_filter_rule
 from companion.config.section import Disagreement, Section
 
 
-def _checked_udp_endpoint(endpoint: str) -> str:
-    port = int(endpoint.rpartition(":")[2])
-    least = 0 if endpoint.startswith("udpin:") else 1
-    if not least <= port <= 65535:
-        raise ValueError(f"a port from {least} to 65535" + (" (0: any free one)" if least == 0 else ""))
-    return endpoint
+def _checked_endpoints(found: object) -> object:
+    urls = found if isinstance(found, list) else [found]
+    if not urls:
+        raise ValueError("at least one endpoint")
+    for url in urls:
+        if not isinstance(url, str):
+            raise ValueError('an endpoint such as "udpin:127.0.0.1:14540", or a list of such')  # noqa: TRY004  pydantic takes ValueError
+        parse_endpoint_url(url)
+    return found
+
+
+def _checked_filters(found: object) -> object:
+    if not isinstance(found, list) or not all(isinstance(rule, str) for rule in found):
+        raise ValueError('a list of rules such as "deny out planner message=30,31"')
+    for rule in found:
+        parse_filter_rule(rule)
+    return found
 
 
 class LinkConfig(Section):
-    """The two UDP sides of the inline proxy."""
+    """The two sides of the inline proxy, with one endpoint or several each."""
 
     planner: Annotated[
-        str,
+        str | list[str],
+        BeforeValidator(_checked_endpoints),
         Field(
-            pattern=r"^udp(in|out):[^:]+:[0-9]{1,5}$",
-            description="Planner and ground-station side. udpin:HOST:PORT listens, udpout:HOST:PORT sends first.",
+            description="Planner and ground-station side: one endpoint, or a list. udpin:HOST:PORT and tcpin:HOST:PORT listen, udpout:HOST:PORT and tcp:HOST:PORT call, serial:/dev/serial/by-id/NAME:BAUD is a line.",
             examples=["udpin:127.0.0.1:14540", "udpout:192.168.1.20:14550"],
         ),
-        AfterValidator(_checked_udp_endpoint),
     ] = "udpin:127.0.0.1:14540"
     autopilot: Annotated[
-        str,
+        str | list[str],
+        BeforeValidator(_checked_endpoints),
         Field(
-            pattern=r"^udp(in|out):[^:]+:[0-9]{1,5}$",
-            description="Autopilot side, in the same form.",
-            examples=["udpin:127.0.0.1:14541", "udpout:127.0.0.1:14580"],
+            description="Autopilot side, in the same forms.",
+            examples=["udpin:127.0.0.1:14541", "serial:/dev/serial/by-id/usb-Auterion_PX4-if00:921600"],
         ),
-        AfterValidator(_checked_udp_endpoint),
     ] = "udpin:127.0.0.1:14541"
+    filters: Annotated[
+        list[str],
+        BeforeValidator(_checked_filters),
+        Field(
+            description="What links let in and out: allow or deny, in or out, a link (planner, planner.2, autopilot, * for all), then system=, component= and message= with ids of the sender and message, as 1,5-7. The first rule that matches decides; a link with an allow rule denies what no rule matches.",
+            examples=["deny out planner.2 message=30-32", "deny in planner system=200-254"],
+        ),
+    ] = []  # noqa: RUF012  pydantic copies it for each instance
     component_id: Annotated[
         int, Field(ge=1, le=255, description="Our own component id (191 MAV_COMP_ID_ONBOARD_COMPUTER).")
     ] = 191
@@ -65,8 +84,29 @@ class LinkConfig(Section):
         ),
     ] = 200
 
+    @property
+    def planner_urls(self) -> tuple[str, ...]:
+        """The planner side's endpoints."""
+        return (self.planner,) if isinstance(self.planner, str) else tuple(self.planner)
+
+    @property
+    def autopilot_urls(self) -> tuple[str, ...]:
+        """The autopilot side's endpoints."""
+        return (self.autopilot,) if isinstance(self.autopilot, str) else tuple(self.autopilot)
+
+    @property
+    def filter_rules(self) -> tuple[FilterRule, ...]:
+        """What links let in and out."""
+        return tuple(parse_filter_rule(rule) for rule in self.filters)
+
     def _disagreements(self) -> tuple[Disagreement, ...]:
-        same = self.planner == self.autopilot and not self.planner.endswith(":0")
-        if not same:
-            return ()
-        return (Disagreement("autopilot", f'"{self.autopilot}"', "another endpoint than planner's"),)
+        seen: set[str] = set()
+        for key, urls in (("planner", self.planner_urls), ("autopilot", self.autopilot_urls)):
+            for url in urls:
+                if url in seen and not parse_endpoint_url(url).may_repeat:
+                    allowed = (
+                        "another endpoint than planner's" if key == "autopilot" else "each endpoint once"
+                    )
+                    return (Disagreement(key, f'"{url}"', allowed),)
+                seen.add(url)
+        return ()

@@ -1,4 +1,4 @@
-"""A UDP endpoint of MAVLink: datagrams in, frames out, and the other way round.
+"""UDP endpoints of MAVLink: datagrams in, frames out, and the other way round.
 
 ``udpin:HOST:PORT`` listens and learns its peers from what arrives; ``udpout:HOST:PORT`` has one peer and sends
 first. Nothing a peer does ends an endpoint: it may send garbage, vanish and come back, from the same port or
@@ -9,21 +9,22 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import re
 import socket
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from contextlib import suppress
 from types import TracebackType
 from typing import Final, Self
 
+from companion.config.endpoint_url import parse_endpoint_url
 from companion.errors import LinkError
-from companion.mavlink.framing import Framer, FramingCounters, RawFrame
+from companion.mavlink.endpoint import Endpoint, FrameReceiver, LinkCounters, reopen_delay_s
+from companion.mavlink.framing import Framer, FramingCounters
+
+__all__ = ["Address", "FrameReceiver", "LinkCounters", "UdpEndpoint"]
 
 Address = tuple[str, int]
-FrameReceiver = Callable[[list[RawFrame]], None]
 
-_URL: Final = re.compile(r"udp(?P<direction>in|out):(?P<host>[^:]+):(?P<port>\d{1,5})")
 _RECEIVE_BUFFER_BYTES: Final = 4 << 20
 """Bursts wait in the kernel while this process is busy (the kernel may grant less)."""
 _SEND_BUFFER_BYTES: Final = 1 << 20
@@ -32,37 +33,12 @@ _DATAGRAMS_PER_TURN: Final = 64
 """Then the other side and the other loops get their turn."""
 
 
-@dataclass(slots=True)
-class LinkCounters:
-    """What an endpoint has seen since it was opened.
-
-    Attributes
-    ----------
-    received_datagrams, received_bytes
-        Everything that arrived.
-    framing
-        Frames, garbage bytes and checksum errors.
-    sent_datagrams, sent_bytes
-        Counted once for each peer.
-    send_drops
-        Datagrams that the kernel did not take (buffer full, no route, too long).
-    unheard_datagrams
-        Datagrams to send while no peer was known.
-    socket_errors
-        Errors that the kernel reported later (nobody listens there); the endpoint goes on.
-    refused_peers
-        Datagrams of senders beyond the greatest number of peers.
-    """
-
-    received_datagrams: int = 0
-    received_bytes: int = 0
-    framing: FramingCounters = field(default_factory=FramingCounters)
-    sent_datagrams: int = 0
-    sent_bytes: int = 0
-    send_drops: int = 0
-    unheard_datagrams: int = 0
-    socket_errors: int = 0
-    refused_peers: int = 0
+_SILENT_NS: Final = 5_000_000_000
+"""A host called by its name that is silent for so long is looked up again: it may have moved."""
+_ADDRESS_LOST: Final = frozenset(
+    {errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EADDRNOTAVAIL, errno.EINVAL, errno.ENODEV}
+)
+"""Our own address is gone, or there is no way from it: a connected socket keeps its address for good, a new one gets another."""
 
 
 class _Peer:
@@ -76,7 +52,7 @@ class _Peer:
         self.has_sent_frames = False
 
 
-class UdpEndpoint:
+class UdpEndpoint(Endpoint):
     """One UDP socket and its peers. ``async with`` is the lifetime.
 
     Frames are handed to `on_frames` in the call that received them, one list a datagram: order holds, and
@@ -111,22 +87,23 @@ class UdpEndpoint:
         max_peers: int = 16,
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        match = _URL.fullmatch(url)
-        if match is None or int(match["port"]) > 65535:
+        super().__init__(url, name)
+        try:
+            parsed = parse_endpoint_url(url)
+        except ValueError as error:
+            raise LinkError(f"{name}: cannot read {url!r}; expected {error}") from error
+        if parsed.kind not in ("udpin", "udpout"):
             raise LinkError(f"{name}: cannot read {url!r}; expected udpin:HOST:PORT or udpout:HOST:PORT")
-        if match["direction"] == "out" and int(match["port"]) == 0:
-            raise LinkError(f"{name}: {url!r} needs a port to send to")
-        self.url = url
-        self.name = name
-        self.counters = LinkCounters()
-        self.on_frames: FrameReceiver | None = None
-        self._listens = match["direction"] == "in"
-        self._host, self._port = match["host"], int(match["port"])
+        self._listens = parsed.listens
+        self._host, self._port = parsed.where, parsed.number
         self._peer_timeout_ns = int(peer_timeout_s * 1e9)
         self._max_peers = max_peers
         self._now_ns = now_ns
         self._socket: socket.socket | None = None
         self._peers: dict[Address, _Peer] = {}
+        self._reopening: asyncio.Task[None] | None = None
+        self._looked_up_ns = now_ns()
+        self._may_move = not self._listens and not _is_number(self._host)
 
     async def __aenter__(self) -> Self:
         """Open the socket.
@@ -136,28 +113,13 @@ class UdpEndpoint:
         LinkError
             When the host is unknown or the port cannot be had; the message says what to do.
         """
-        loop = asyncio.get_running_loop()
         try:
-            found = await loop.getaddrinfo(
-                self._host, self._port, family=socket.AF_INET, type=socket.SOCK_DGRAM
-            )
+            address = await self._look_up()
         except OSError as error:
             raise LinkError(f"{self.name}: unknown host {self._host!r} in {self.url!r}") from error
-        address: Address = (str(found[0][4][0]), self._port)
-        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            opened.setblocking(False)
-            opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
-            opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
-            if self._listens:
-                opened.bind(address)
-            else:
-                opened.connect(address)
-                self._peers[address] = _Peer(self.counters.framing, self._now_ns())
-                self._peers[address].has_sent_frames = True  # sent to from the start
+            self._open(address)
         except OSError as error:
-            opened.close()
-            self._peers.clear()
             verb = "listen on" if self._listens else "send to"
             hint = (
                 "; another program has this port (is the companion running already?)"
@@ -167,18 +129,90 @@ class UdpEndpoint:
             raise LinkError(
                 f"{self.name}: cannot {verb} {self._host}:{self._port}: {error.strerror}{hint}"
             ) from error
-        self._socket = opened
-        loop.add_reader(opened.fileno(), self._read)
         return self
 
     async def __aexit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
     ) -> None:
         """Close the socket; what is sent afterwards is dropped."""
+        task, self._reopening = self._reopening, None
+        if task is not None:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+        self._close()
+        self._become("closed")
+
+    async def _look_up(self) -> Address:
+        found = await asyncio.get_running_loop().getaddrinfo(
+            self._host, self._port, family=socket.AF_INET, type=socket.SOCK_DGRAM
+        )
+        return str(found[0][4][0]), self._port
+
+    def _open(self, address: Address) -> None:
+        """Open a socket in place of the one that there may be."""
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            opened.setblocking(False)
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+            if self._listens:
+                opened.bind(address)
+            else:
+                opened.connect(address)
+        except OSError:
+            opened.close()
+            raise
+        self._close()
+        self._socket = opened
+        if not self._listens:
+            self._peers = {address: _Peer(self.counters.framing, self._now_ns())}
+            self._peers[address].has_sent_frames = True  # sent to from the start
+        asyncio.get_running_loop().add_reader(opened.fileno(), self._read)
+        self._become("open")
+
+    def _close(self) -> None:
         if self._socket is not None:
             asyncio.get_running_loop().remove_reader(self._socket.fileno())
             self._socket.close()
             self._socket = None
+
+    def _open_anew(self, reason: str) -> None:
+        """Begin to open the socket again; until that succeeds the old one goes on being tried."""
+        if self._reopening is None:
+            self._become(f"waiting: {reason}")
+            self._reopening = asyncio.get_running_loop().create_task(self._reopen(), name=self.name)
+
+    async def _reopen(self) -> None:
+        failures = 0
+        while True:
+            await asyncio.sleep(reopen_delay_s(failures))
+            failures += 1
+            try:
+                self._open(await self._look_up())
+            except OSError as error:
+                self._become(f"waiting: {error.strerror or error}")
+                continue
+            self._reopening = None
+            return
+
+    async def _follow(self) -> None:
+        """Look whether the host's name means another address now; called while it is silent."""
+        try:
+            address = await self._look_up()
+            if address not in self._peers:
+                self._open(address)
+        except OSError as error:  # the name server is away as well: the old address is as good as any
+            self.counters.socket_errors += 1
+            self._become(f"waiting: {error.strerror or error}")
+        self._reopening = None
+
+    def _follow_when_silent(self) -> None:
+        now_ns = self._now_ns()
+        silent_since_ns = max(self._looked_up_ns, *(peer.heard_ns for peer in self._peers.values()))
+        if now_ns - silent_since_ns > _SILENT_NS and self._reopening is None:
+            self._looked_up_ns = now_ns
+            self._reopening = asyncio.get_running_loop().create_task(self._follow(), name=self.name)
 
     @property
     def local_address(self) -> Address:
@@ -187,6 +221,16 @@ class UdpEndpoint:
             raise LinkError(f"{self.name}: not open")
         host, port = self._socket.getsockname()
         return host, port
+
+    @property
+    def label(self) -> str:
+        """The address that is listened on, or called."""
+        return "{}:{}".format(*self.local_address) if self._socket is not None and self._listens else self.url
+
+    @property
+    def peer_names(self) -> tuple[str, ...]:
+        """Addresses that are sent to."""
+        return tuple(f"{host}:{port}" for host, port in self.peers)
 
     @property
     def peers(self) -> tuple[Address, ...]:
@@ -199,6 +243,8 @@ class UdpEndpoint:
         if self._socket is None or not datagram:
             return 0
         taken = 0
+        if self._may_move:
+            self._follow_when_silent()
         addresses = self.peers
         for address in addresses:
             try:
@@ -206,8 +252,10 @@ class UdpEndpoint:
                     self._socket.sendto(datagram, address)
                 else:
                     self._send_connected(self._socket, datagram)
-            except OSError:  # full buffer, no route, a closed port reported by an earlier datagram
+            except OSError as error:  # full buffer, no route, a closed port reported by an earlier datagram
                 self.counters.send_drops += 1
+                if error.errno in _ADDRESS_LOST and not self._listens:
+                    self._open_anew(error.strerror or str(error))
             else:
                 taken += 1
         self.counters.unheard_datagrams += not addresses
@@ -251,8 +299,7 @@ class UdpEndpoint:
         frames = peer.framer.feed(datagram)
         if frames:
             peer.has_sent_frames = True
-            if self.on_frames is not None:
-                self.on_frames(frames)
+            self._deliver(frames)
 
     def _admit(self, address: Address) -> _Peer | None:
         """Return a new peer, or None where there are too many."""
@@ -272,3 +319,11 @@ class UdpEndpoint:
         oldest_ns = self._now_ns() - self._peer_timeout_ns
         for address in [a for a, peer in self._peers.items() if peer.heard_ns < oldest_ns]:
             del self._peers[address]
+
+
+def _is_number(host: str) -> bool:
+    try:
+        socket.inet_aton(host)
+    except OSError:
+        return False
+    return True

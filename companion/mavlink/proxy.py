@@ -1,5 +1,7 @@
 """The inline proxy: every frame goes through as it came, setpoints of position and velocity as the handler decides.
 
+Each side may have several links (``network``, ``routing``); which of them a frame goes to is decided after what is sent.
+
 Everything happens in the call that received a datagram: no queue, no task, no wait. So order holds, nothing
 can stall, and several frames of one datagram leave as one datagram again.
 
@@ -25,10 +27,11 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
+from companion.config.link_filter import FilterRule
 from companion.guidance.setpoint import (
     Drop,
     Forward,
@@ -41,9 +44,10 @@ from companion.guidance.setpoint import (
     Verdict,
 )
 from companion.mavlink import codec, requests, telemetry
+from companion.mavlink.endpoint import Link, LinkCounters
 from companion.mavlink.framing import INCOMPAT_SIGNED, RawFrame
 from companion.mavlink.identity import is_autopilot
-from companion.mavlink.link import FrameReceiver, LinkCounters
+from companion.mavlink.network import Network
 from companion.mavlink.requests import EngageRequest
 from companion.mavlink.signing import Signatures, link_id_of, without_signature
 from companion.mavlink.sources import SetpointSources, Source
@@ -100,14 +104,14 @@ class ProxyHandler(Protocol):
         ...
 
 
-class Endpoint(Protocol):
-    """One side of the proxy: `companion.mavlink.link.UdpEndpoint`, or any other transport."""
+class OwnComponent(Protocol):
+    """Takes what is said to our own component: ``companion.mavlink.component.OwnComponent``."""
 
-    on_frames: FrameReceiver | None
-    counters: LinkCounters
+    message_ids: frozenset[int]
+    """Frames of other messages are not offered."""
 
-    def send(self, datagram: bytes) -> int:
-        """Send to all peers of this side and return how many took it. Never blocks, never raises."""
+    def takes(self, frame: RawFrame, *, from_autopilot: bool, now_ns: int) -> bool:
+        """Take a frame; return whether it was for us alone and is not to be passed on."""
         ...
 
 
@@ -137,10 +141,12 @@ class ProxyCounters:
         Failures of the handler, and verdicts that cannot be carried out.
     unusable_telemetry
         Messages of interest whose fields could not be used.
+    unrouted_frames
+        Frames with a target that no link has heard of, and those that filters kept from leaving.
     """
 
-    planner: LinkCounters
-    autopilot: LinkCounters
+    planner: Sequence[LinkCounters]
+    autopilot: Sequence[LinkCounters]
     to_autopilot_frames: int = 0
     to_planner_frames: int = 0
     setpoints_in: int = 0
@@ -152,6 +158,7 @@ class ProxyCounters:
     rivalries: int = 0
     handler_errors: int = 0
     unusable_telemetry: int = 0
+    unrouted_frames: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """Return all counts by name, for logs and summaries."""
@@ -167,6 +174,7 @@ class ProxyCounters:
             "to_planner_frames": self.to_planner_frames,
             "handler_errors": self.handler_errors,
             "unusable_telemetry": self.unusable_telemetry,
+            "unrouted_frames": self.unrouted_frames,
             **{f"planner_{name}": count for name, count in _link_counts(self.planner).items()},
             **{f"autopilot_{name}": count for name, count in _link_counts(self.autopilot).items()},
         }
@@ -178,27 +186,37 @@ class InlineProxy:
     Parameters
     ----------
     planner, autopilot
-        The two sides; their `on_frames` is taken over.
+        The two sides, one link or several each; their `on_frames` is taken over.
     handler
         Decides on setpoints.
     now_ns
         Monotonic time.
     signatures
         Verifies signed setpoints and signs them again; None: there is no key.
+    own
+        Our own component; None: nobody is spoken to here.
+    filters
+        What the links let in and out; in a link's way in they stand before everything else here.
     """
 
     def __init__(
         self,
-        planner: Endpoint,
-        autopilot: Endpoint,
+        planner: Link | Sequence[Link],
+        autopilot: Link | Sequence[Link],
         handler: ProxyHandler,
         *,
         now_ns: Callable[[], int],
         signatures: Signatures | None = None,
+        own: OwnComponent | None = None,
+        filters: Sequence[FilterRule] = (),
     ) -> None:
-        self.counters = ProxyCounters(planner.counters, autopilot.counters)
-        self._planner = planner
-        self._autopilot = autopilot
+        planner = planner if isinstance(planner, Sequence) else (planner,)
+        autopilot = autopilot if isinstance(autopilot, Sequence) else (autopilot,)
+        self.counters = ProxyCounters(
+            [link.counters for link in planner], [link.counters for link in autopilot]
+        )
+        self.network = Network(planner, autopilot, self._received, filters=filters)
+        """The links; its `router` knows who was heard where."""
         self._handler = handler
         self._now_ns = now_ns
         self._vehicle: Heartbeat | None = None
@@ -207,30 +225,50 @@ class InlineProxy:
         self._last_failure = ""
         self._sources = SetpointSources()
         self._signatures = signatures
-        planner.on_frames = self._from_planner
-        autopilot.on_frames = self._from_autopilot
+        self._own = own
+        self._own_ids = frozenset() if own is None else own.message_ids
 
     @property
     def vehicle(self) -> Heartbeat | None:
         """The newest HEARTBEAT of the autopilot whose telemetry counts; None before the first."""
         return self._vehicle
 
+    def _received(self, link: int, frames: list[RawFrame]) -> None:
+        """Take what a link received, and pass on what is left of it."""
+        if link in self.network.autopilot_links:
+            self._from_autopilot(link, frames)
+        else:
+            self._from_planner(link, frames)
+        self.counters.unrouted_frames = self.network.unrouted_frames
+
     # ------------------------------------------------------------------ planner -> autopilot
 
-    def _from_planner(self, frames: list[RawFrame]) -> None:
+    def _from_planner(self, link: int, frames: list[RawFrame]) -> None:
         now_ns = self._now_ns()
-        out: list[bytes] = []
+        out: list[RawFrame] = []
         for frame in frames:
-            data = frame.data
+            if frame.message_id in self._own_ids and self._is_for_own(frame, now_ns, from_autopilot=False):
+                continue
             if frame.message_id in _NAMES:
                 data = self._setpoint(frame, now_ns)
+                if not data:
+                    continue
+                if data is not frame.data:
+                    frame = frame._replace(data=data)  # noqa: PLW2901  from here on it is this frame that is sent
             elif frame.message_id in requests.MESSAGE_IDS:
                 self._note_request(frame, now_ns)
-            if data:
-                out.append(data)
+            out.append(frame)
         if out:
-            self.counters.to_autopilot_frames += len(out)
-            self._autopilot.send(out[0] if len(out) == 1 else b"".join(out))
+            self.counters.to_autopilot_frames += self.network.forward(link, out)
+
+    def _is_for_own(self, frame: RawFrame, now_ns: int, *, from_autopilot: bool) -> bool:
+        """Offer a frame to our own component; return whether it was for it alone."""
+        own = self._own
+        try:
+            return own is not None and own.takes(frame, from_autopilot=from_autopilot, now_ns=now_ns)
+        except Exception as error:  # noqa: BLE001  the frame goes on whatever our own component does
+            self._handler_failed("takes", error)
+            return False
 
     def _note_request(self, frame: RawFrame, now_ns: int) -> None:
         """Tell the handler of a request for OFFBOARD or arming before it is sent: the HEARTBEAT says so a second late."""
@@ -341,10 +379,18 @@ class InlineProxy:
 
     # ------------------------------------------------------------------ autopilot -> planner
 
-    def _from_autopilot(self, frames: list[RawFrame]) -> None:
-        self.counters.to_planner_frames += len(frames)
-        self._planner.send(frames[0].data if len(frames) == 1 else b"".join([f.data for f in frames]))
+    def _from_autopilot(self, link: int, frames: list[RawFrame]) -> None:
         now_ns = self._now_ns()
+        own_ids = self._own_ids
+        if any(frame.message_id in own_ids for frame in frames):
+            frames = [
+                frame
+                for frame in frames
+                if frame.message_id not in own_ids or not self._is_for_own(frame, now_ns, from_autopilot=True)
+            ]
+            if not frames:
+                return
+        self.counters.to_planner_frames += self.network.forward(link, frames)
         for frame in frames:
             if frame.message_id in telemetry.MESSAGE_IDS and frame.component_id == _AUTOPILOT_COMPONENT:
                 self._telemetry(frame, now_ns)
@@ -370,6 +416,7 @@ class InlineProxy:
         if self._vehicle is None or silent or heartbeat.system_id == self._vehicle.system_id:
             self._vehicle = heartbeat
             self._vehicle_heard_ns = now_ns
+            self.network.router.own_system_id = heartbeat.system_id
 
     def _handler_failed(self, call: str, error: Exception) -> None:
         self.counters.handler_errors += 1
@@ -379,9 +426,9 @@ class InlineProxy:
             _LOG.error("the proxy's handler failed in %s", call, exc_info=error)
 
 
-def _link_counts(link: LinkCounters) -> dict[str, int]:
+def _link_counts(links: Sequence[LinkCounters]) -> dict[str, int]:
     return {
-        "garbage_bytes": link.framing.garbage_bytes,
-        "crc_errors": link.framing.crc_errors,
-        "send_drops": link.send_drops,
+        "garbage_bytes": sum(link.framing.garbage_bytes for link in links),
+        "crc_errors": sum(link.framing.crc_errors for link in links),
+        "send_drops": sum(link.send_drops for link in links),
     }

@@ -20,7 +20,7 @@ from companion.config import Config
 from companion.errors import CompanionError, ConfigError, first_of
 from companion.frames.source import FrameSource
 from companion.log import Log
-from companion.mavlink.link import UdpEndpoint
+from companion.mavlink.endpoint import Endpoint
 from companion.service import Service
 from companion.sim.companion_process import CompanionProcessError, Event
 
@@ -83,8 +83,8 @@ class CompanionTask:
                 raise
 
     @property
-    def links(self) -> tuple[UdpEndpoint, ...]:
-        """Both sides of the service, the planner's first."""
+    def links(self) -> tuple[Endpoint, ...]:
+        """The links of the service, the planner's side first."""
         return self._service.links
 
     def of(self, name: str) -> list[Event]:

@@ -112,10 +112,15 @@ def test_an_integer_does_for_a_float():
         ),
         (
             '[link]\nautopilot = "serial:x"',
-            (
-                'link.autopilot: found "serial:x"; allowed: text such as "udpin:127.0.0.1:14541"'
-                ' or "udpout:127.0.0.1:14580"'
-            ),
+            'link.autopilot: found "serial:x"; allowed: serial:/dev/serial/by-id/NAME:BAUD',
+        ),
+        (
+            '[link]\nplanner = ["udpin:h:1", "tcp:h"]',
+            "link.planner: found a list; allowed: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT",
+        ),
+        (
+            '[link]\nfilters = ["deny out planner message=9-3"]',
+            "link.filters: found a list; allowed: message ids from 0 to 16777215, the lower one first",
         ),
         (
             '[link]\nplanner = "udpout:h:0"',

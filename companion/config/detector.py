@@ -12,14 +12,20 @@ from companion.config.section import Disagreement, Section
 class DetectorConfig(Section):
     """The detector in its worker process."""
 
+    method: Annotated[
+        Literal["paper", "parallax"],
+        Field(
+            description="paper: the published method (clusters of flow, lines). parallax: the void map: ranges from dense flow, swept by the vehicle's size, remembered, with a confidence."
+        ),
+    ] = "paper"
     preset: Annotated[
         Literal["default", "paper"],
-        Field(description="Parameter set: default (measured best) or paper (literal)."),
+        Field(description="Parameter set of the method paper: default (measured best) or paper (literal)."),
     ] = "default"
     params_file: Annotated[
         str,
         Field(
-            description="TOML file with detector parameters that replace those of the preset; empty: none."
+            description="TOML file with parameters of the method paper that replace those of the preset; empty: none."
         ),
     ] = ""
     deadline_s: Annotated[
@@ -68,6 +74,8 @@ class DetectorConfig(Section):
     ] = 1
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
+        if self.method == "parallax" and self.params_file:
+            return (Disagreement("params_file", self.params_file, 'empty where method is "parallax"'),)
         if self.restart_delay_s <= self.restart_delay_max_s:
             return ()
         return (

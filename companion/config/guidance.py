@@ -171,6 +171,14 @@ class GuidanceConfig(Section):
             description="Reports without an answer in a row (too little texture, blurred, ...; not: no motion) that end the last answer.",
         ),
     ] = 2
+    min_confidence: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1,
+            description="Answers that are less sure than this count as none, and what they measured is not flown by: HOLD. Only the detector's method parallax says how sure it is. Larger: safer, stands more often.",
+        ),
+    ] = 0.3
     probe_timeout_s: Annotated[
         float, Field(gt=0, le=60, description="A probe that brought no answer in this time has failed (s).")
     ] = 5.0

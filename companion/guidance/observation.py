@@ -57,7 +57,7 @@ class DetectionReport:
     frame_seq, frame_ns
         The second frame of the pair: its number and when it was exposed (our monotonic time).
     kind
-        ``vanishing_point``, ``lowest_flow``, ``single_plane`` or ``none``.
+        ``vanishing_point``, ``lowest_flow`` (the paper's method), ``gap`` (of the void map, method ``parallax``), ``single_plane`` or ``none``.
     reason
         The detector's reason where kind is ``none``, else "".
     detail
@@ -73,7 +73,11 @@ class DetectionReport:
     distance_m, distance_spread_m
         Metric time to contact along the direction, or to the plane; None when not known.
     bearings
-        Free distance by azimuth. An azimuth that is not listed is unknown, and unknown is not free.
+        Free distance by azimuth, as far as this frame saw it. An azimuth that is not listed is unknown, and unknown is not free.
+    remembered
+        Free distance by azimuth out of this frame's view, from frames before it (method ``parallax``).
+    confidence
+        In [0, 1]: how often answers like it are right. None where the method does not say.
     obstacles
         Places at the vehicle's height where something was surely seen nearby: north and east in local NED, m.
     earlier_frame_ns
@@ -96,6 +100,8 @@ class DetectionReport:
     distance_m: float | None = None
     distance_spread_m: float | None = None
     bearings: tuple[BearingRange, ...] = ()
+    remembered: tuple[BearingRange, ...] = ()
+    confidence: float | None = None
     obstacles: tuple[tuple[float, float], ...] = ()
     earlier_frame_ns: int | None = None
     detector_s: float = 0.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from companion.config import GuidanceConfig
 from companion.guidance.coordinates import azimuth_of_body_ray, heading_rad, wrap_rad
@@ -21,6 +21,7 @@ from companion.guidance.wish import Wish
 
 _NO_PARALLAX = ("no_motion", "no_earlier_frame")
 """Reasons of the detector that say nothing about the scene: the last answer stays and ages."""
+_UNSURE = "low_confidence"
 _MIN_STEP_M = 0.2
 """A way that is not free for this much (beyond the margin) is blocked."""
 _MIN_GAP_M = 1.2
@@ -165,6 +166,7 @@ class Evidence:
         if report.frame_ns <= self.newest_frame_ns or report.frame_ns > now_ns + _FUTURE_NS:
             return
         self.newest_frame_ns = report.frame_ns
+        report = _believed(report, self._config.min_confidence)
         self.last_report_ns = now_ns
         self.last_report = report
         is_of_this_frame = (
@@ -252,7 +254,9 @@ class Evidence:
     def says_no_texture(self) -> bool:
         """Whether the last picture could not be used, for another reason than lack of motion."""
         last = self.last_report
-        return last is not None and last.kind == "none" and last.reason not in _NO_PARALLAX
+        if last is None or last.reason == _UNSURE:
+            return False  # another look, from a little further on, is what makes it sure
+        return last.kind == "none" and last.reason not in _NO_PARALLAX
 
     def lacks_parallax(self) -> bool:
         """Whether the last picture said nothing for want of motion."""
@@ -373,6 +377,16 @@ def remaining_m(report: DetectionReport, pose: Pose) -> float:
         return 0.0
     moved_m = math.hypot(pose.north_m - origin.north_m, pose.east_m - origin.east_m)
     return report.distance_m - moved_m
+
+
+def _believed(report: DetectionReport, min_confidence: float) -> DetectionReport:
+    """Return a report without what it is not sure enough of; what it saw to stand nearby still counts."""
+    if report.confidence is None or report.confidence >= min_confidence:
+        return report
+    detail = f"confidence {report.confidence:.2f}, at least {min_confidence:g} needed"
+    return replace(
+        report, kind="none", reason=_UNSURE, detail=detail, ray_body=None, distance_m=None, bearings=()
+    )
 
 
 def _pair_began_ns(report: DetectionReport) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -48,13 +49,6 @@ def build_pipeline(detector: DetectorConfig, camera: CameraConfig) -> VoidPipeli
     """
     cv2.setNumThreads(detector.threads)
     try:
-        if detector.params_file:
-            params = DetectorParams.from_toml(Path(detector.params_file), detector.preset)
-        else:
-            params = DetectorParams.preset(detector.preset)
-    except ParamsError as error:
-        raise ConfigError(f"detector.params_file: {error}") from error
-    try:
         calibrated = CameraModel.from_file(camera.file) if camera.file else None
     except CameraError as error:
         raise ConfigError(f"camera.file: {error}") from error
@@ -65,7 +59,31 @@ def build_pipeline(detector: DetectorConfig, camera: CameraConfig) -> VoidPipeli
         baseline_min_m=0.4 * detector.baseline_m,
         baseline_max_m=1.8 * detector.baseline_m,
     )
+    if detector.method == "parallax":
+        # Only here: the worker loads one method.
+        from companion.vision.parallax_child import ParallaxPipeline
+
+        return ParallaxPipeline(camera, calibrated, vehicle)
+    try:
+        if detector.params_file:
+            params = DetectorParams.from_toml(Path(detector.params_file), detector.preset)
+        else:
+            params = DetectorParams.preset(detector.preset)
+    except ParamsError as error:
+        raise ConfigError(f"detector.params_file: {error}") from error
     return VoidPipeline(params, camera, calibrated, vehicle)
+
+
+class FrameObserver(Protocol):
+    """What turns a stream of frames into answers."""
+
+    def observe(self, image: NDArray[np.uint8], time_ns: int, pose: CameraPose | None = None) -> Observation:
+        """Take the next frame, (H, W) uint8, with its time and the camera's pose, and answer on it."""
+        ...
+
+    def between_frames(self) -> None:
+        """Do what is left to do for the next answer."""
+        ...
 
 
 class VoidPipeline:
@@ -100,7 +118,7 @@ class VoidPipeline:
             math.radians(camera.mount_yaw_deg),
         )
         self._model: CameraModel | None = None
-        self._observer: VoidObserver | None = None
+        self._observer: FrameObserver | None = None
 
     def detect(self, frame: Frame, pose: Pose | None) -> DetectionReport:
         """Return the report on one frame. A frame of another size starts anew."""
@@ -120,7 +138,7 @@ class VoidPipeline:
                     pose=pose,
                     detector_s=time.perf_counter() - began_s,
                 )
-            observer = VoidObserver(self._params, model, observer_params=self._observer_params)
+            observer = self._observer_of(model)
             self._model, self._observer = model, observer
         r_ned_from_camera = (
             None if pose is None else r_ned_from_body(pose.q_ned_from_body) @ self._r_body_from_camera
@@ -137,6 +155,9 @@ class VoidPipeline:
         """Prepare for the next frame (:meth:`VoidObserver.between_frames`)."""
         if self._observer is not None:
             self._observer.between_frames()
+
+    def _observer_of(self, model: CameraModel) -> FrameObserver:
+        return VoidObserver(self._params, model, observer_params=self._observer_params)
 
     def _model_for(self, width_px: int, height_px: int) -> CameraModel:
         if self._calibrated is None:

@@ -64,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     # Their command lines are their own (``_OWN_PARSERS``); here they are for the list of commands.
     commands.add_parser("sim", help="fly closed loop in a simulated indoor world", add_help=False)
     commands.add_parser("cameras", help="list cameras, take a picture, measure their timing", add_help=False)
+    commands.add_parser("doctor", help="say what is missing before a flight, and what to do", add_help=False)
     commands.add_parser("calibrate", help="make or judge a camera file with a board", add_help=False)
     return parser
 
@@ -80,6 +81,12 @@ def _cameras_parser() -> argparse.ArgumentParser:
     return cameras_parser()
 
 
+def _doctor_parser() -> argparse.ArgumentParser:
+    from companion.doctor.command import doctor_parser
+
+    return doctor_parser()
+
+
 def _calibrate_parser() -> argparse.ArgumentParser:
     from companion.calibrate.command import calibrate_parser
 
@@ -89,6 +96,7 @@ def _calibrate_parser() -> argparse.ArgumentParser:
 _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
     "sim": _sim_parser,
     "cameras": _cameras_parser,
+    "doctor": _doctor_parser,
     "calibrate": _calibrate_parser,
 }
 """Commands whose modules import much that nothing else needs."""

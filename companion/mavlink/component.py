@@ -53,11 +53,11 @@ _OF_AUTOPILOT: Final = frozenset({TIMESYNC, COMMAND_ACK}) | _COUNTED
 MESSAGE_IDS: Final = _REQUESTS | _OF_AUTOPILOT
 """What `OwnComponent.takes` looks at."""
 
-_TIMESYNC: Final = struct.Struct("<qq")
+TIMESYNC_FIELDS: Final = struct.Struct("<qq")
 _RC_CHANNELS: Final = struct.Struct("<I18HBB")
-_FLAGS_AT: Final = {ESTIMATOR_STATUS: 40, EKF_STATUS_REPORT: 20}
+FLAGS_AT: Final = {ESTIMATOR_STATUS: 40, EKF_STATUS_REPORT: 20}
 _ACK: Final = struct.Struct("<HBBiBB")
-_FLAGS: Final = struct.Struct("<H")
+FLAGS: Final = struct.Struct("<H")
 _AUTOPILOT_COMPONENT: Final = 1
 _REFUSED_TEXT: Final = "unsigned or wrongly signed request refused"
 
@@ -173,9 +173,9 @@ class OwnComponent:
             case _ if frame.message_id == RC_CHANNELS:
                 values = _RC_CHANNELS.unpack(payload.ljust(_RC_CHANNELS.size, b"\0")[: _RC_CHANNELS.size])
                 self._listener.on_rc_channels(values[1 : 1 + min(18, values[19])], now_ns)
-            case message_id if message_id in _FLAGS_AT:
-                at = _FLAGS_AT[message_id]
-                self._listener.on_estimator(_FLAGS.unpack_from(payload.ljust(at + 2, b"\0"), at)[0], now_ns)
+            case message_id if message_id in FLAGS_AT:
+                at = FLAGS_AT[message_id]
+                self._listener.on_estimator(FLAGS.unpack_from(payload.ljust(at + 2, b"\0"), at)[0], now_ns)
         return False
 
     def tick(self, now_ns: int) -> None:
@@ -234,7 +234,7 @@ class OwnComponent:
         return signatures.verify(frame) is None
 
     def _clock(self, payload: bytes, now_ns: int) -> bool:
-        tc1, ts1 = _TIMESYNC.unpack(payload.ljust(_TIMESYNC.size, b"\0")[: _TIMESYNC.size])
+        tc1, ts1 = TIMESYNC_FIELDS.unpack(payload.ljust(TIMESYNC_FIELDS.size, b"\0")[: TIMESYNC_FIELDS.size])
         if tc1 == 0 or not self._timesync.is_ours(ts1):
             return False
         sync = self._timesync.on_answer(tc1, ts1, now_ns)

@@ -14,6 +14,8 @@ _FOURCC = {"MJPEG": "MJPG"}
 _SIZE_PX = (640, 480)
 _RATE_HZ = 5  # vivid draws its pictures on the emulated processor: at 15/s it falls behind by itself
 _HERE = Path(__file__).parent
+_HONEST_STAMPS = "timestamp_source=1"
+"""vivid hands pictures out before the time that it says they ended; with the start of exposure it keeps to the truth."""
 _CONTROLS = {
     "brightness": 90,
     "contrast": 77,
@@ -30,6 +32,7 @@ def run_all(capture_s: float) -> None:
         check(f"capture: {name}", lambda name=name: _capture_format(name))
     check("controls: set by the configuration", _controls)
     check("controls: an unknown one is refused", _unknown_control)
+    check("capture: stamps ahead of the clock", _future_stamps)
     check(f"capture: {capture_s:.0f} s, time stamps", lambda: _capture_long(capture_s))
 
 
@@ -64,10 +67,10 @@ def _capture_format(name: str) -> str:
         raise CheckSkippedError(f"vivid does not offer {name}")
     found = probe(format=name, frames=20)
     require(found["size_px"] == list(_SIZE_PX), f"size {found['size_px']}")
-    # vivid's colour bars: white on the left, black on the right; a wrong plane or stride shows nothing of the kind.
-    bars = found["columns"]
-    require(bars[0] > 120 and bars[-1] < 60, f"no colour bars: mean grey of eighths {bars}")
-    return f"{found['frames']} frames, {found['rate_hz']:.1f}/s, bars {bars[0]:.0f} to {bars[-1]:.0f}"
+    # vivid's upright colour bars: with a wrong plane there are none, with a wrong line length they lean.
+    require(found["contrast"] > 120, f"no colour bars: grey spans {found['contrast']:.0f}")
+    require(found["skew"] < 10, f"colour bars that lean: {found['skew']:.0f} of {found['contrast']:.0f}")
+    return f"{found['frames']} frames, {found['rate_hz']:.1f}/s, upright bars over {found['contrast']:.0f} of grey"
 
 
 def _controls() -> str:
@@ -85,6 +88,14 @@ def _controls() -> str:
     return f"{asked}; read back by v4l2-ctl"
 
 
+def _future_stamps() -> str:
+    found = probe(format="GREY", frames=20, controls="timestamp_source=0")
+    require(found["least_age_ms"] >= 0.0, f"a frame from the future: {found['least_age_ms']:.2f} ms")
+    require(found["backward"] == 0, f"{found['backward']} time stamps do not increase")
+    kind = "some by their time of arrival" if not found["of_exposure"] else "all by the driver's time"
+    return f"20 frames, none from the future, {kind}"
+
+
 def _unknown_control() -> str:
     try:
         probe(format="GREY", frames=1, controls="no_such_control=1", limit_s=20)
@@ -95,7 +106,7 @@ def _unknown_control() -> str:
 
 
 def _capture_long(capture_s: float) -> str:
-    found = probe(format="GREY", seconds=capture_s)
+    found = probe(format="GREY", seconds=capture_s, controls=_HONEST_STAMPS)
     require(found["of_exposure"], "frames carry the time of arrival, not the driver's")
     require(found["backward"] == 0, f"{found['backward']} time stamps do not increase")
     require(found["least_age_ms"] >= -1.0, f"a frame from the future: {found['least_age_ms']:.2f} ms")

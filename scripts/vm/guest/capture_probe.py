@@ -42,7 +42,8 @@ async def capture(asked: dict, log) -> dict:
             times_ns.append(frame.time_ns)
             numbers.append(frame.seq)
             kinds.add(frame.time_of)
-            columns = [round(float(part.mean()), 1) for part in np.array_split(frame.image, 8, axis=1)]
+            lower = frame.image[frame.image.shape[0] // 2 :].astype(float)  # below vivid's text
+            upper_half, lower_half = np.array_split(lower, 2)
             size_px = [frame.image.shape[1], frame.image.shape[0]]
             started_s = started_s or time.monotonic()
             if "seconds" in asked:
@@ -61,7 +62,8 @@ async def capture(asked: dict, log) -> dict:
         "rate_hz": (len(numbers) - 1) / span_s if span_s else 0.0,
         "driver_rate_hz": asked["rate_hz"],
         "size_px": size_px,
-        "columns": columns,
+        "contrast": float(np.ptp(lower.mean(axis=0))),
+        "skew": float(np.abs(upper_half.mean(axis=0) - lower_half.mean(axis=0)).mean()),
         "of_exposure": kinds == {"exposure"},
         "backward": int((np.diff(times) <= 0).sum()),
         "least_age_ms": float(ages_ms.min()),

@@ -9,15 +9,35 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from collections.abc import Awaitable, Callable
+from functools import partial
+
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.errors import CompanionError
 from companion.sim.autopilot import FakeAutopilot
 from companion.sim.companion_process import CompanionProcess
-from companion.sim.planner import Planner, Waypoint
+from companion.sim.planner import Planner, PlannerError, Waypoint
+from companion.sim.telemetry import STREAMS
 from companion.sim.traffic import compare
 
 _CAMERA_EVENTS = frozenset(
     {"camera_opened", "camera_lost", "source_opened", "state", "worker_died", "worker_ready"}
+)
+
+
+_TRIES = 10
+_POSE_HZ = 10.0
+_LOSS_S = 20.0
+_STATION_ID = 254  # not the planner's: its messages are none of those that are compared
+_SET_MESSAGE_INTERVAL = int(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)
+_ANSWERS = frozenset((mavlink.MAVLINK_MSG_ID_COMMAND_ACK, mavlink.MAVLINK_MSG_ID_TIMESYNC))
+_POSES = frozenset(
+    (
+        mavlink.MAVLINK_MSG_ID_ODOMETRY,
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE,
+    )
 )
 
 
@@ -28,6 +48,32 @@ def say(phase: str, **fields: object) -> None:
 def on_event(event: dict) -> None:
     if event.get("event") in _CAMERA_EVENTS:
         say("event", **{key: value for key, value in event.items() if key != "phase"})
+
+
+def is_answer(frame: bytes) -> bool:
+    """Whether a MAVLink 2 frame answers somebody: the service asks the autopilot too, and has what answers it."""
+    return int.from_bytes(frame[7:10], "little") in _ANSWERS
+
+
+async def slow_down(autopilot: FakeAutopilot) -> None:
+    """Ask for telemetry a tenth as often as PX4 sends it: the emulated processor has no time for more."""
+    async with Planner(autopilot.address, rate_hz=1.0, system_id=_STATION_ID) as station:
+        for message_id, stream in STREAMS.items():
+            if stream.rate_hz > 1.0:
+                interval_us = 1e6 / _POSE_HZ if message_id in _POSES else 1e6
+                await patiently(
+                    partial(station.command, _SET_MESSAGE_INTERVAL, float(message_id), interval_us)
+                )
+
+
+async def patiently(ask: Callable[[], Awaitable[None]]) -> None:
+    """Ask again where the answer is late; a refusal that stays is one."""
+    for _ in range(_TRIES - 1):
+        try:
+            return await ask()
+        except PlannerError:
+            await asyncio.sleep(1.0)
+    return await ask()
 
 
 async def fly(node: str) -> None:
@@ -43,42 +89,43 @@ async def fly(node: str) -> None:
         "camera": {"hfov_deg": 75.0},
         # The processor is emulated: what a board does in a tenth of a second takes seconds here.
         "detector": {"deadline_s": 60.0, "start_timeout_s": 300.0},
+        "guidance": {"pose_max_age_s": 3.0, "planner_timeout_s": 10.0},
         "log": {"status_interval_s": 1.0, "detections": True},
     }
     loop = asyncio.get_running_loop()
-    async with CompanionProcess(tables, on_event=on_event) as service:
-        started = await service.wait_for("service_started", 240.0)
-        ends = {
-            side: (started[side].rpartition(":")[0], int(started[side].rpartition(":")[2]))
-            for side in ("planner", "autopilot")
-        }
-        async with (
-            FakeAutopilot(ends["autopilot"], keep_frames=True) as autopilot,
-            Planner(ends["planner"], rate_hz=5.0, keep_frames=True) as planner,
-        ):
-            await service.wait_for("worker_ready", 300.0)
-            await planner.wait_ready(60.0)
-            planner.aim(Waypoint(5.0, 0.0, -1.2))
-            await planner.arm()
-            await planner.start_offboard()
-            first, first_down = len(planner.sent_frames), len(autopilot.sent_frames)
-            say("flying", pid=service.pid)
-            await loop.run_in_executor(None, sys.stdin.readline)
-            mode, armed = str(planner.mode), planner.armed
-            last, last_down = len(planner.sent_frames), len(autopilot.sent_frames)
-            planner.stop_streaming()
-            await asyncio.sleep(3.0)
-            up, down = planner.sent_frames, autopilot.sent_frames
-            traffic = compare(
-                up[first:last],
-                autopilot.received_frames,
-                down[first_down:last_down],
-                planner.received_frames,
-                not_judged=[*up[:first], *up[last:], *down[:first_down], *down[last_down:]],
-            )
-            code = await service.stop()
-            totals = {name: getattr(traffic, name) for name in traffic.__slots__}
-            say("done", code=code, mode=mode, armed=armed, other_lines=service.other_lines[-5:], **totals)
+    async with FakeAutopilot(keep_frames=True, parameters={"COM_OF_LOSS_T": _LOSS_S}) as autopilot:
+        await slow_down(autopilot)
+        tables["link"] = {"autopilot": "udpout:{}:{}".format(*autopilot.address)}
+        async with CompanionProcess(tables, on_event=on_event) as service:
+            started = await service.wait_for("service_started", 240.0)
+            host, _, port = started["planner"].rpartition(":")
+            async with Planner((host, int(port)), rate_hz=5.0, keep_frames=True) as planner:
+                await service.wait_for("worker_ready", 300.0)
+                await planner.wait_ready(60.0)
+                first, first_down = len(planner.sent_frames), len(autopilot.sent_frames)
+                planner.aim(Waypoint(5.0, 0.0, -1.2))
+                await patiently(planner.arm)
+                await patiently(planner.start_offboard)
+                say("flying", pid=service.pid)
+                await loop.run_in_executor(None, sys.stdin.readline)
+                mode, armed = str(planner.mode), planner.armed
+                planner.stop_streaming()
+                last, last_down = len(planner.sent_frames), len(autopilot.sent_frames)
+                await asyncio.sleep(3.0)  # what is on its way arrives
+                up, down = planner.sent_frames, autopilot.sent_frames
+                meanwhile = down[first_down:last_down]
+                judged = [frame for frame in meanwhile if not is_answer(frame)]
+                answers = [frame for frame in meanwhile if is_answer(frame)]
+                traffic = compare(
+                    up[first:last],
+                    autopilot.received_frames,
+                    judged,
+                    planner.received_frames,
+                    not_judged=[*up[:first], *up[last:], *down[:first_down], *down[last_down:], *answers],
+                )
+                code = await service.stop()
+                totals = {name: getattr(traffic, name) for name in traffic.__slots__}
+                say("done", code=code, mode=mode, armed=armed, other_lines=service.other_lines[-5:], **totals)
 
 
 def main() -> int:

@@ -24,6 +24,7 @@ from companion.guidance.wish import express, wish_of
 from companion.log import Log
 from companion.log_fields import report_fields, verdict_fields
 from companion.mavlink.identity import Identity, MavSeverity, MavState
+from companion.mavlink.obstacle_distance import obstacle_distance
 from companion.mavlink.requests import EngageRequest
 from companion.mavlink.sources import Source
 from companion.mavlink.telemetry import (
@@ -345,6 +346,10 @@ class Interception:
         self._last_report = report
         self._report_waiting = report
         self.switch.on_report(report, now_ns)
+        if self._config.detector.send_obstacle_distance:
+            distances = obstacle_distance(report, self.switch.pose)
+            if distances is not None:
+                self._identity.send(distances)
         if self._config.log.detections:
             self._log.info("detection", **report_fields(report, now_ns))
 

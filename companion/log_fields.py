@@ -67,6 +67,7 @@ def report_fields(report: DetectionReport, now_ns: int) -> dict[str, Any]:
         "y_px": report.y_px,
         "baseline_m": report.baseline_m,
         "distance_m": report.distance_m,
+        "confidence": report.confidence,
         "time_to_contact_frames": report.time_to_contact_frames,
     }
     for name, value in optional.items():

@@ -66,6 +66,12 @@ class DetectorConfig(Section):
             description="Distance flown between the two frames of a pair that is aimed at (m); 0.4 to 1.8 times of it is taken. Larger: surer ranges, fewer tracks that survive.",
         ),
     ] = 0.25
+    send_obstacle_distance: Annotated[
+        bool,
+        Field(
+            description="Send the free distances as OBSTACLE_DISTANCE (72 bins about the nose, unknown ones as unknown), for the autopilot's own collision prevention. Needs poses, which give the scale."
+        ),
+    ] = False
     threads: Annotated[
         int,
         Field(

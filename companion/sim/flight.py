@@ -30,7 +30,7 @@ from companion.sim.frame_faults import FrameFaults
 from companion.sim.image_effects import ImageEffects
 from companion.sim.vehicle import Vector3
 
-Method = Literal["paper", "off"]
+Method = Literal["paper", "parallax", "off"]
 PlannerKind = Literal["waypoints", "mavsdk"]
 """``waypoints``: ``companion.sim.planner``. ``mavsdk``: an unmodified mavsdk client, in real time only."""
 
@@ -55,7 +55,7 @@ class FlightSpec:
     seed
         Of the random world, the camera's noise and the estimate's errors.
     method
-        ``paper``: the service with the detector's default preset. ``off``: no service.
+        ``paper``: the service with the detector's default preset. ``parallax``: the service with the void map. ``off``: no service.
     planner
         Who streams setpoints.
     realtime

@@ -49,7 +49,7 @@ async def _fly(loop: LockstepLoop, spec: FlightSpec, place: Place) -> FlownFligh
         autopilot = await stack.enter_async_context(autopilot_of(spec, place, clock))
         service: CompanionTask | None = None
         address: Address = autopilot.address
-        if spec.method == "paper":
+        if spec.method != "off":
             camera = SteppedCamera(
                 stack.enter_context(camera_of(spec, place)()),
                 camera_model_of(spec),

@@ -59,7 +59,7 @@ async def _fly(spec: FlightSpec, place: Place) -> FlownFlight:
         autopilot = await stack.enter_async_context(autopilot_of(spec, place, clock))
         service: CompanionProcess | None = None
         address: Address = autopilot.address
-        if spec.method == "paper":
+        if spec.method != "off":
             service = await _started_service(spec, place, autopilot, recorder, stack)
             started = await service.wait_for("service_started", _WORKER_START_S)
             host, _, port = started["planner"].rpartition(":")

@@ -44,7 +44,11 @@ _ONE_SURFACE_SCATTER: Final = 1.6  # times the noise: beyond it the samples see 
 _HIT_SHARE: Final = 0.10
 _COVER_HALF_HEIGHT: Final = math.sin(math.radians(14.0))
 _COVER_STEP: Final = 0.85
+_NEAREST_COVER_M: Final = 0.7
 _COVER_SLACK: Final = 1.3  # what stands a little nearer than the distance covers it too: it is met itself
+_BEHIND: Final = 1.25
+"""What is surely this much farther away is behind a thing, not it."""
+_GRAZE_M: Final = 0.06
 _LEAST_COVER_M: Final = 0.25
 
 
@@ -488,8 +492,11 @@ def free_range_along(
         vouched = MetricRange(covered_m, vouched.spread_m, vouched.samples)
 
     along_m, beside_m, above_m = np.stack((ray, side, vertical)) @ samples.points_m.T
-    inside = samples.is_resolved & (along_m > 0.0)
-    inside &= (np.abs(beside_m) <= half_width_m) & (np.abs(above_m) <= half_height_m)
+    ahead = samples.is_resolved & (along_m > 0.0) & (np.abs(above_m) <= half_height_m)
+    inside = ahead & (np.abs(beside_m) <= half_width_m)
+    if math.isfinite(hidden_width_m):
+        beyond = ahead & ~inside & (np.abs(beside_m) <= half_width_m + hidden_width_m)
+        inside |= _may_reach_in(samples, ray, side, vertical, along_m, beside_m, beyond, half_width_m)
     hits_m = np.sort(along_m[inside])
     triples = np.flatnonzero(hits_m[_HIT_SAMPLES - 1 :] <= (1.0 + _HIT_SHARE) * hits_m[: 1 - _HIT_SAMPLES])
     if triples.size == 0 or hits_m[triples[0] + 1] >= vouched.distance_m:
@@ -521,8 +528,8 @@ def _covered_m(
     nearest_per_m = samples.inverse_per_m[level] + 2.0 * samples.sigma_per_m[level]
     order = np.argsort(azimuth_rad)
     azimuth_rad, nearest_per_m = azimuth_rad[order], nearest_per_m[order]
-    distance_m = most_m
-    while distance_m > _LEAST_COVER_M:
+    covered_m = _LEAST_COVER_M
+    for distance_m in (*_ladder(_NEAREST_COVER_M, most_m), most_m):
         half_rad = math.atan2(half_width_m, distance_m)
         seen_rad = azimuth_rad[nearest_per_m * distance_m < _COVER_SLACK]
         first, last = np.searchsorted(seen_rad, (-half_rad, half_rad))
@@ -530,10 +537,54 @@ def _covered_m(
         left = seen_rad[first - 1 : first] if first else (-half_rad,)
         right = seen_rad[last : last + 1] if last < len(seen_rad) else (half_rad,)
         gaps_rad = np.diff(np.concatenate([left, seen_rad[first:last], right]))
-        if float(gaps_rad.max()) * distance_m <= hidden_width_m:
-            return distance_m
-        distance_m *= _COVER_STEP
-    return _LEAST_COVER_M
+        if float(gaps_rad.max()) * distance_m > hidden_width_m:
+            return covered_m
+        covered_m = distance_m
+    return covered_m
+
+
+def _ladder(first_m: float, most_m: float) -> list[float]:
+    """Return distances from the first to below the last, each a step beyond the one before."""
+    steps = math.ceil(math.log(most_m / first_m) / -math.log(_COVER_STEP)) if most_m > first_m else 0
+    return [first_m / _COVER_STEP**step for step in range(max(0, steps))]
+
+
+def _may_reach_in(
+    samples: RangeSamples,
+    ray: NDArray[np.float64],
+    side: NDArray[np.float64],
+    vertical: NDArray[np.float64],
+    along_m: NDArray[np.float64],
+    beside_m: NDArray[np.float64],
+    beyond: NDArray[np.bool_],
+    half_width_m: float,
+) -> NDArray[np.bool_]:
+    """Return which of the samples just beside the way may belong to something that reaches into it.
+
+    A smooth pillar is seen at one textured side of it only. It ends, at the latest, where the next sample toward the way is surely
+    seen through to farther away.
+
+    Returns
+    -------
+    (N,) bool, a part of ``beyond``.
+    """
+    found = np.zeros(len(beyond), np.bool_)
+    if not beyond.any():
+        return found
+    forward, to_side, above = np.stack((ray, side, vertical)) @ samples.rays.T
+    level = (np.abs(above) <= _COVER_HALF_HEIGHT) & (forward > 0.0)
+    azimuth_rad = np.arctan2(to_side, forward)
+    nearest_per_m = samples.inverse_per_m + 2.0 * samples.sigma_per_m
+    index = np.flatnonzero(beyond)
+    looked = np.flatnonzero(level)
+    sign = np.where(beside_m[index] < 0.0, 1.0, -1.0)  # toward the way
+    inward = sign[:, None] * (azimuth_rad[looked][None, :] - azimuth_rad[index][:, None])
+    through = (inward > 0.0) & (nearest_per_m[looked][None, :] * (_BEHIND * along_m[index][:, None]) < 1.0)
+    next_rad = sign * azimuth_rad[index] + np.where(through, inward, math.pi).min(axis=1, initial=math.pi)
+    # Measured from the way's middle toward the other side: the least reach is minus half the width.
+    reach_m = along_m[index] * np.tan(np.clip(next_rad, -1.4, 1.4))
+    found[index] = reach_m > -half_width_m + _GRAZE_M
+    return found
 
 
 def _vouched(inverse: NDArray[np.float64], sigma: NDArray[np.float64]) -> MetricRange:

@@ -15,7 +15,7 @@ from companion.guidance.obstacles import NearObstacles
 _BIN_RAD = math.radians(3.0)
 _TRACK_GAP_M = 1.0
 """Two positions in a row further apart than this: what lies between was not seen to be flown."""
-_REMEMBERED_SHARE = 0.85
+_REMEMBERED_SHARE = 1.0
 """Of the vehicle's width with its margins: less of the margin beside what was already passed."""
 _ANOTHER_PLACE_M = 1.0
 _MATCH_RAD = math.radians(4.0)

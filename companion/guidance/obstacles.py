@@ -15,6 +15,8 @@ _MOST_SIGHTINGS = 4
 """More are not counted: what was seen wrongly for a while can be seen to be free again."""
 _THROUGH_RAD = math.radians(2.0)
 _BEYOND_M = 0.4
+_SEEN_WHOLE_M = 1.2
+"""Nearer than this the camera sees a part of a thing at most, and past it: that says nothing of the rest."""
 _FORGET_M = 5.0
 _FORGET_NS = 60_000_000_000
 _CLOSING = 0.9
@@ -158,7 +160,7 @@ def _sees_through(report: DetectionReport, pose: Pose, cell: _Cell) -> bool:
     """Whether a report measured the way free to clearly beyond a cell."""
     north_m, east_m = cell.north_m - pose.north_m, cell.east_m - pose.east_m
     distance_m, azimuth = math.hypot(north_m, east_m), math.atan2(east_m, north_m)
-    return any(
+    return distance_m >= _SEEN_WHOLE_M and any(
         abs(wrap_rad(bearing.azimuth_rad - azimuth)) <= _THROUGH_RAD
         and bearing.distance_m - bearing.spread_m >= distance_m + _BEYOND_M
         for bearing in report.bearings

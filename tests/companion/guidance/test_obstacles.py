@@ -63,13 +63,21 @@ def test_after_a_minute_or_five_metres_it_is_forgotten():
 
 
 def test_what_is_measured_free_behind_it_erases_a_wrong_sighting_in_time():
-    memory = remembered((1.0, 0.0))
-    memory.add(seen((1.0, 0.0), seq=2))
-    through = DetectionReport(9, 9, "lowest_flow", pose=pose(), bearings=(BearingRange(0.0, 3.0, 0.0, 9),))
+    memory = remembered((2.0, 0.0))
+    memory.add(seen((2.0, 0.0), seq=2))
+    through = DetectionReport(9, 9, "lowest_flow", pose=pose(), bearings=(BearingRange(0.0, 4.0, 0.0, 9),))
     memory.add(through)
     assert memory.free_m(0.0, pose(), 0) is not None, "one measurement is not enough"
     memory.add(through)
     assert memory.free_m(0.0, pose(), 0) is None
+
+
+def test_a_thing_close_by_is_not_erased_by_what_is_seen_past_it():
+    memory = remembered((0.8, 0.1))
+    for seq in range(5):
+        bearings = (BearingRange(0.1, 4.0, 0.0, 9),)
+        memory.add(DetectionReport(9 + seq, 9, "lowest_flow", pose=pose(), bearings=bearings))
+    assert memory.free_m(0.0, pose(), 0) == pytest.approx(0.8)
 
 
 def test_the_way_between_two_jambs_is_their_middle():

@@ -27,6 +27,9 @@ say() { echo "install: $*"; }
 
 systemd_runs() { [ -d /run/systemd/system ]; }
 
+# Cameras and serial ports that are there get the names that the rules of now give them.
+rename_devices() { udevadm trigger --action=change --subsystem-match=video4linux --subsystem-match=tty; }
+
 usage() { sed -n '2,7s/^# \{0,1\}//p' "$0"; }
 
 wheels=""
@@ -75,6 +78,7 @@ remove_everything() {
         systemctl daemon-reload
         systemctl reset-failed --quiet $name.service 2>/dev/null || true # systemd has forgotten it already
         udevadm control --reload
+        rename_devices
     fi
 }
 
@@ -188,7 +192,7 @@ install -D -m 0644 "$here/systemd/void-companion.rules" "$rules"
 if systemd_runs; then
     systemctl daemon-reload
     udevadm control --reload
-    udevadm trigger --action=change --subsystem-match=video4linux --subsystem-match=tty
+    rename_devices
 fi
 if [ $enable = yes ]; then
     systemctl enable --quiet $name.service

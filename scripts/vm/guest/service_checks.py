@@ -115,12 +115,6 @@ def _works() -> str:
     _wait_for_event("camera_opened", _START_S)
     _wait_for_event("worker_ready", _START_S)
     vivid.until(lambda: _last_event("status").get("frames_hz", 0.0) > 0, 120.0, "frames in the status line")
-    refused = [
-        line
-        for line in run("journalctl", "-k", "-o", "cat").splitlines()
-        if "audit" in line and "SECCOMP" in line
-    ]
-    require(not refused, f"system calls were refused: {refused[:2]}")
     status = _last_event("status")
     return (
         f"{status['frames_hz']} frames/s, worker {status['worker']}, after {time.monotonic() - since_s:.0f} s"
@@ -218,9 +212,10 @@ def _came_up() -> str:
 
 def _uninstall() -> str:
     run(str(_INSTALLER), "--uninstall", limit_s=300)
-    roots = ["/etc", "/opt", "/usr/local", "/var/lib", "/var/log", "/run", "/dev/shm"]  # noqa: S108  looked at only
+    roots = ["/etc", "/opt", "/usr/local", "/var/lib", "/var/log", "/run", "/dev"]  # noqa: S108  looked at only
+    run("udevadm", "settle")
     words = ["find", *roots, "-xdev", "-iname", "*void*companion*"]
-    left = [line for line in run(*words).splitlines() if "/udev/" not in line]
+    left = run(*words).splitlines()
     require(not left, f"left: {left}")
     try:
         pwd.getpwnam("void-companion")

@@ -212,7 +212,7 @@ def _came_up() -> str:
 
 def _uninstall() -> str:
     run(str(_INSTALLER), "--uninstall", limit_s=300)
-    roots = ["/etc", "/opt", "/usr/local", "/var/lib", "/var/log", "/run", "/dev"]  # noqa: S108  looked at only
+    roots = ["/etc", "/opt", "/usr/local", "/var/lib", "/var/log", "/run", "/dev"]
     run("udevadm", "settle")
     words = ["find", *roots, "-xdev", "-iname", "*void*companion*"]
     left = run(*words).splitlines()

@@ -31,6 +31,7 @@ _CONVERGED_RAD: Final = 1e-6
 _FREE_ROTATION_RAD: Final = math.radians(5.0)
 """Weak prior where no attitude is given: the coarse rotation is better than this."""
 _STARTS: Final = ((0.0, 0.0, 1.0), (0.7, 0.0, 0.7), (-0.7, 0.0, 0.7), (0.0, 0.7, 0.7), (0.0, -0.7, 0.7))
+_STILL_SIGMAS: Final = 2.0
 _STILL_PERCENTILE: Final = 80.0
 
 
@@ -137,6 +138,12 @@ def parallax_left_rad(field: FlowField) -> float:
     length_px = np.where(both, np.linalg.norm(left_px, axis=1), known)
     length_px = length_px[np.isfinite(length_px)]
     return float(np.percentile(length_px, _STILL_PERCENTILE)) / used.camera.fx_px if len(length_px) else 0.0
+
+
+def still_limit_rad(camera: CameraModel, params: ParallaxParams) -> float:
+    """Return the parallax below which there was no motion: the setting, or what the flow's own noise looks like where pixels are coarse."""
+    reduction = max(1, round(camera.width_px / params.width_px))
+    return max(params.still_rad, _STILL_SIGMAS * params.flow_sigma_px * reduction / camera.fx_px)
 
 
 def estimate_egomotion(

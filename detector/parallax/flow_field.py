@@ -7,6 +7,7 @@ is the covariance of the flow, small across an edge and large along it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -28,9 +29,9 @@ _SCHARR_NOISE: Final = 236.0 / 32.0**2
 _NOISE_KERNEL: Final = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _COARSE_WIDTH_PX: Final = 320
 _COARSE_STEP_PX: Final = 6
-_COARSE_ROUNDS: Final = 2
+_SHIFT_LARGE_RAD: Final = 0.03
 _SHIFT_WIDTH_PX: Final = 160
-_COARSE_GRADIENT: Final = 4.0
+_SHIFT_GAIN: Final = 0.7
 _COARSE_LEAST: Final = 30
 
 
@@ -158,27 +159,44 @@ def coarse_rotation(
     size = (later.shape[1] // reduction, later.shape[0] // reduction)
     small = camera.scaled_to(*size)
     before, now = _reduced(earlier, size), _reduced(later, size)
-    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     at = _grid(size, _COARSE_STEP_PX)
     column, row = at.T.astype(np.intp)
     strength = cv2.cornerMinEigenVal(now, 7, ksize=3)[row, column]
     chosen = strength > np.quantile(strength, 0.4)
-    at, column, row = at[chosen], column[chosen], row[chosen]
+    at = at[chosen]
     if len(at) < _COARSE_LEAST:
         return np.eye(3)
-    rotation = _by_shift(before, now, small)
-    ends = small.pixel_to_ray(at)
-    for _ in range(_COARSE_ROUNDS):
-        turned, seen = turned_picture(before, small, rotation)
-        back = np.asarray(search.calc(now, turned, None), np.float32)  # type: ignore[call-overload]  # no start is allowed
-        start = at + back[row, column]
-        inside = cv2.remap(seen, start[:, None, 0], start[:, None, 1], cv2.INTER_NEAREST, borderValue=0.0)
-        rays = small.pixel_to_ray(start)
-        good = (inside.reshape(-1) > 0) & np.isfinite(rays).all(axis=1) & np.isfinite(ends).all(axis=1)
-        if int(good.sum()) < _COARSE_LEAST:
-            break
-        rotation = fit_rotation(rays[good], ends[good]) @ rotation
+    shifted = _by_shift(before, now, small)
+    rotation, missed = _turned_by_flow(before, now, small, at, shifted)
+    if float(np.abs(shifted - np.eye(3)).max()) > _SHIFT_LARGE_RAD:
+        # Repeated bricks match a brick away nearly as well: a large turn has to explain the picture clearly better than a small one does.
+        plain, missed_plain = _turned_by_flow(before, now, small, at, np.eye(3))
+        if missed > _SHIFT_GAIN * missed_plain:
+            rotation = plain
     return rotation
+
+
+def _turned_by_flow(
+    before: NDArray[np.uint8],
+    now: NDArray[np.uint8],
+    camera: CameraModel,
+    at: NDArray[np.float32],
+    rotation: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float]:
+    """Return a rotation after a round of flow from a start, and the grey difference that the flow leaves at its samples."""
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    turned, seen = turned_picture(before, camera, rotation)
+    back = np.asarray(search.calc(now, turned, None), np.float32)  # type: ignore[call-overload]  # no start is allowed
+    column, row = at.T.astype(np.intp)
+    start = at + back[row, column]
+    inside = cv2.remap(seen, start[:, None, 0], start[:, None, 1], cv2.INTER_NEAREST, borderValue=0.0)
+    found = cv2.remap(turned, start[:, None, 0], start[:, None, 1], cv2.INTER_LINEAR).reshape(-1)
+    ends, rays = camera.pixel_to_ray(at), camera.pixel_to_ray(start)
+    good = (inside.reshape(-1) > 0) & np.isfinite(rays).all(axis=1) & np.isfinite(ends).all(axis=1)
+    if int(good.sum()) < _COARSE_LEAST:
+        return rotation, math.inf
+    missed = np.abs(now[row, column].astype(np.float64) - found)[good]
+    return fit_rotation(rays[good], ends[good]) @ rotation, float(missed.mean())
 
 
 def _by_shift(

@@ -26,6 +26,7 @@ from detector.parallax.egomotion import (
     estimate_egomotion,
     focus_of_expansion,
     parallax_left_rad,
+    still_limit_rad,
 )
 from detector.parallax.flow_field import FlowField, measure_flow
 from detector.parallax.params import ParallaxParams
@@ -218,8 +219,11 @@ class ParallaxDetector:
         baseline_m = None if translation_earlier_m is None else float(np.linalg.norm(translation_earlier_m))
         # A camera that is known to have moved and sees no parallax looks at something far away.
         moved = baseline_m is not None and baseline_m >= params.least_baseline_m
-        if left_rad < params.still_rad and not moved:
-            detail = f"a turn alone leaves {1e3 * left_rad:.2f} mrad of flow, limit {1e3 * params.still_rad:.2f} mrad"
+        limit_rad = still_limit_rad(camera, params)
+        if left_rad < limit_rad and not moved:
+            detail = (
+                f"a turn alone leaves {1e3 * left_rad:.2f} mrad of flow, limit {1e3 * limit_rad:.2f} mrad"
+            )
             return _nothing(NoDetectionReason.NO_MOTION, detail, counts)
         direction = (
             None

@@ -27,6 +27,7 @@ _CAUCHY: Final = 2.3
 _INLIER_SIGMAS: Final = 3.0
 _LEAST_CLOSING: Final = 1e-3
 """Of the distance, in a pair: a plane that nears more slowly has no time to contact."""
+_SURE_CONTACT: Final = 0.25
 _GRIC_LIMIT: Final = 2.0
 _GRIC_SPACE: Final = 4.0
 
@@ -123,8 +124,14 @@ def fit_plane(
 
 
 def plane_is_wall(fit: PlaneFit, params: ParallaxParams) -> bool:
-    """Return whether one plane fills the view and comes nearer: GRIC prefers it, and it explains nearly everything."""
-    return fit.preferred and fit.share >= params.plane_share and fit.contact is not None
+    """Return whether one plane fills the view and surely comes nearer: GRIC prefers it, and it explains nearly everything.
+
+    What is far all over is a plane too, at infinity: there the time to contact is lost in its own uncertainty.
+    """
+    contact = fit.contact
+    if contact is None or contact.spread_frames > _SURE_CONTACT * contact.frames:
+        return False
+    return fit.preferred and fit.share >= params.plane_share
 
 
 def distance_along_axis_m(fit: PlaneFit, motion: Egomotion, baseline_m: float) -> float | None:

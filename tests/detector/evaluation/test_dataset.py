@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -76,6 +77,29 @@ def test_a_turn_to_the_right_takes_what_was_ahead_to_the_left():
     assert (motion.later_from_earlier @ [0.0, 0.0, 1.0])[0] == pytest.approx(-math.sin(math.radians(10.0)))
     assert motion.translation_earlier_m == pytest.approx([0.0, 0.0, 1.0])
     assert math.degrees(motion.rotation_rad) == pytest.approx(10.0)
+
+
+def test_level_is_what_the_cameras_agree_on():
+    images = load_truth(OFFICE)
+    for pair in images.pairs:
+        level = images.level_from_later(pair)
+        assert level @ level.T == pytest.approx(np.eye(3), abs=1e-4)
+        assert np.linalg.det(level) == pytest.approx(1.0, abs=1e-4)
+        assert level[2, 1] > 0.7  # the camera's lower edge is below
+        # A head looks down rather than up while it walks.
+        assert -0.2 < level[2, 2] < 0.7
+
+
+def test_cameras_that_agree_on_no_vertical_have_no_level():
+    about = [pose(yaw_deg=0.0), pose(z_m=1.0)]
+    images = walk(*about)
+    assert images.level_from_later(Pair(a="0.png", b="1.png")) is not None
+    leaning = np.eye(4)
+    leaning[:3, :3] = (
+        cv2.Rodrigues(np.array([0.0, 0.0, np.pi / 4]))[0] @ cv2.Rodrigues(np.array([0.7, 0.0, 0.0]))[0]
+    )
+    images = walk(leaning.tolist(), leaning.tolist())  # on its edge and looking down: near no axis
+    assert images.level_from_later(Pair(a="0.png", b="1.png")) is None
 
 
 def test_what_is_said_of_a_pair_goes_before_what_is_said_of_its_frame():

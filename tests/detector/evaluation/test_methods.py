@@ -100,3 +100,48 @@ def test_every_method_answers_resets_and_has_lines(name):
     method.reset()
     assert method.answer(PairInput(*approach(), camera=camera)) == before
     assert method.vanishing_point(np.full((480, 640), 90, np.uint8)) is None
+
+
+@pytest.mark.parametrize("nearer", ["left", "right"])
+def test_flow_balance_turns_away_from_the_side_that_moves_more(nearer):
+    rng = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(rng.integers(0, 255, (240, 400), np.uint8), (0, 0), 1.5)
+    texture = cv2.normalize(texture, None, 20, 235, cv2.NORM_MINMAX)
+    earlier = np.hstack([texture[:, 40:200], texture[:, 200:360]])
+    later = np.hstack([texture[:, 46:206], texture[:, 201:361]])  # 6 px on the left, 1 px on the right
+    if nearer == "right":
+        earlier, later = (np.ascontiguousarray(image[:, ::-1]) for image in (earlier, later))
+    answer = METHODS["flow_balance"](PARAMS).answer(PairInput(earlier, later))
+    assert answer.kind == "flow_balance"
+    assert (answer.point_px[0] > 200) is (nearer == "left")
+    assert (answer.point_px[0] < 120) is (nearer == "right")
+
+
+def test_flow_balance_has_no_answer_without_motion():
+    earlier, _ = approach()
+    answer = METHODS["flow_balance"](PARAMS).answer(PairInput(earlier, earlier))
+    assert (answer.kind, answer.reason) == ("none", "no_motion")
+
+
+def test_parallax_takes_what_it_is_told_and_says_where_the_focus_is():
+    images = load_truth(PAIRS / "office" / "groundtruth.json")
+    pair = images.pairs[0]
+    motion = images.motion_of(pair)
+    earlier, later = (
+        cv2.imread(str(images.folder / name), cv2.IMREAD_GRAYSCALE) for name in (pair.a, pair.b)
+    )
+    method = METHODS["parallax"](DetectorParams.preset("default"))
+    told = method.answer(
+        PairInput(
+            earlier,
+            later,
+            images.camera,
+            motion.later_from_earlier,
+            motion.translation_earlier_m,
+            images.level_from_later(pair),
+        )
+    )
+    alone = method.answer(PairInput(earlier, later, images.camera))
+    assert told.focus_px is not None  # estimated: what is told is a prior
+    assert alone.focus_px is not None
+    assert told.focus_px != alone.focus_px

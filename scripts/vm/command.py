@@ -76,10 +76,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _try(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    require_host()
     groups = arguments.groups or list(_GROUPS)
     if unknown := [group for group in groups if group not in _GROUPS]:
         raise VmError(f"unknown group {unknown[0]!r}; known: {', '.join(_GROUPS)}")
+    require_host()
     cache: Path = arguments.cache.resolve()
     cache.mkdir(parents=True, exist_ok=True)
     log = cache / "host.log"

@@ -104,11 +104,11 @@ def build(output: Path, *, python: str, machine: str) -> Path:
     VmError
         When a wheel cannot be had or ``dpkg-deb`` is not there.
     """
-    if shutil.which("dpkg-deb") is None:
-        raise VmError("dpkg-deb is not there: Debian packages are built on Debian or one of its kin")
     major, _, minor = python.partition(".")
     if not (major.isdecimal() and minor.isdecimal()):
         raise VmError(f"--python: found {python!r}; allowed: MAJOR.MINOR, such as 3.11")
+    if shutil.which("dpkg-deb") is None:
+        raise VmError("dpkg-deb is not there: Debian packages are built on Debian or one of its kin")
     output.mkdir(parents=True, exist_ok=True)
     about = tomllib.loads((_PROJECT / "pyproject.toml").read_text())["project"]
     architecture = _ARCHITECTURES[machine]

@@ -27,6 +27,7 @@ from typing import Any, Final
 from companion.clock import Clock
 from companion.config import Config
 from companion.errors import SourceError
+from companion.frames.camera import CameraSource
 from companion.frames.file import FileSource
 from companion.frames.open import open_source
 from companion.frames.source import FrameSource
@@ -90,6 +91,7 @@ class Service:
         self._health_has_run = False
         self._last_frame_ns: int | None = None
         self._source_fault: str | None = "no frame yet"
+        self._camera: CameraSource | None = None
         self._too_slow = False
         self._report_failure = ""
 
@@ -209,6 +211,7 @@ class Service:
         while True:
             try:
                 source = self._open_frames()
+                self._camera = source if isinstance(source, CameraSource) else None
                 async with source:
                     log.info("source_opened", kind=config.scheme)
                     if config.scheme == "file":
@@ -241,13 +244,13 @@ class Service:
         while True:
             now_ns = clock.now_ns()
             config = self._config  # may change in flight
-            camera = self._source_fault
+            camera = self._with_reason(self._source_fault)
             if camera is None and self._last_frame_ns is not None:
                 floor_hz = config.source.min_rate_hz * (_RATE_BACK if self._too_slow else 1.0)
                 slow = flight.statistics.frames.rate_hz(now_ns) < floor_hz
                 self._too_slow = slow and now_ns - started_ns > 3e9
                 if now_ns - self._last_frame_ns > config.source.timeout_s * 1e9:
-                    camera = "no frames from the camera"
+                    camera = self._with_reason("no frames from the camera")
                 elif self._too_slow:
                     camera = "frame rate below the floor"
             flight.set_fault("camera", camera, now_ns)
@@ -259,6 +262,11 @@ class Service:
             self._health_ns = now_ns
             self._health_has_run = True
             await clock.sleep_until_ns(now_ns + _HEALTH_PERIOD_NS)
+
+    def _with_reason(self, fault: str | None) -> str | None:
+        """Return a fault of the source with what the camera itself says of it."""
+        reason = self._camera.fault if self._camera is not None else ""
+        return f"{fault}: {reason}" if fault and reason else fault
 
     async def _heartbeat(self, flight: Interception, identity: Identity) -> None:
         """Send our HEARTBEAT, fed by the loops that it speaks for."""

@@ -94,6 +94,11 @@ class CameraSource:
         self._thread: _CaptureThread | None = None
         self._hung: list[_CaptureThread] = []
 
+    @property
+    def fault(self) -> str:
+        """Why there are no frames now, in short; "" while there are, or nothing is known."""
+        return "" if self._thread is None else self._thread.fault.partition(";")[0]
+
     async def __aenter__(self) -> Self:
         """Start to open the camera and to capture."""
         self._mailbox = NewestMailbox()
@@ -191,6 +196,7 @@ class _CaptureThread:
         self._last_time_ns = -1
         self._delivered_since_open = False
         self._refusal_announced = False
+        self.fault = ""
 
     def start(self) -> None:
         self._thread.start()
@@ -226,6 +232,7 @@ class _CaptureThread:
                 reason = str(error) or type(error).__name__
             if self._stopping.is_set():
                 return
+            self.fault = reason
             if self._delivered_since_open:
                 retry_s, announced = self._limits.first_retry_s, ""
             if reason != announced:  # said once, not at every attempt
@@ -266,6 +273,7 @@ class _CaptureThread:
                 self._counts.wrong_size += 1
             captured.give_back()
             return
+        self.fault = ""
         time_ns, time_of = self._time_of(captured, now_ns)
         if not self._delivered_since_open:
             self._delivered_since_open = True

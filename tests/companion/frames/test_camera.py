@@ -149,9 +149,11 @@ async def test_a_camera_that_is_not_there_at_the_start_is_waited_for(events):
     kernel = FakeKernel({})
     async with source_of(kernel, log) as source:
         await until(lambda: reasons(said()))
+        assert source.fault == f"{NODE}: no such camera"
         await asyncio.sleep(0.1)
         kernel.cameras = {NODE: FakeCamera()}
         assert (await next_of(source.frames())).time_of == "exposure"
+        assert source.fault == ""
     assert reasons(said()) == [f"{NODE}: no such camera; `companion cameras` lists those that are there"]
 
 
@@ -263,6 +265,9 @@ async def test_mavlink_passes_untouched_while_the_camera_goes_and_freezes(events
             heartbeat = common.MAVLink_heartbeat_message(2, 12, 81, 0, 4, 3).pack(common.MAVLink(None, 1, 1))
             autopilot.send(bytes(heartbeat))
             await until(lambda: bool(service.links[1].peers))
+            faults = []
+            health = service._with_reason
+            service._with_reason = lambda fault: faults.append(health(fault)) or faults[-1]
             sent, got = [], []
             for number in range(60):
                 camera.gone = number % 10 in (3, 4)
@@ -276,6 +281,8 @@ async def test_mavlink_passes_untouched_while_the_camera_goes_and_freezes(events
                 await asyncio.sleep(0.02)
             assert got == sent
             await until(lambda: "unplugged" in reasons(said()))
+            camera.frozen, camera.gone = False, True
+            await until(lambda: "no frames from the camera: /dev/video0: no such camera" in faults)
         finally:
             service.stop()
             await asyncio.wait_for(running, 20)

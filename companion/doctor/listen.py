@@ -31,6 +31,7 @@ from companion.mavlink.streams import StreamRequests, needs, request
 from companion.mavlink.telemetry import MAV_AUTOPILOT_PX4, Heartbeat
 from companion.mavlink.timesync import ClockSync, TimeSync
 
+_HEARTBEAT: Final = 0
 PARAM_VALUE: Final = 22
 AUTOPILOT_VERSION: Final = 148
 _PARAM_VALUE: Final = struct.Struct("<fHH16sB")
@@ -63,6 +64,7 @@ class Examination:
         self._streams = StreamRequests()
         self._timesync = TimeSync()
         self._turns = 0
+        self._heartbeats_ns: list[int] = []
         self.vehicle: Heartbeat | None = None
         self.autopilot_systems: set[int] = set()
         self.version: tuple[int, int, int] | None = None
@@ -79,7 +81,7 @@ class Examination:
     def from_autopilot(self, frames: list[RawFrame], now_ns: int) -> None:
         """Take what the autopilot's side says."""
         for frame in frames:
-            if frame.message_id == 0:
+            if frame.message_id == _HEARTBEAT:
                 self._heartbeat(frame)
             vehicle = self.vehicle
             if vehicle is None or (frame.system_id, frame.component_id) != (
@@ -88,6 +90,8 @@ class Examination:
             ):
                 continue
             self._counts[frame.message_id] += 1
+            if frame.message_id == _HEARTBEAT:
+                self._heartbeats_ns.append(now_ns)
             self._streams.count(frame.message_id)
             self._answer(frame, now_ns)
 
@@ -130,7 +134,11 @@ class Examination:
         if self._counting_since_ns is None or now_ns <= self._counting_since_ns:
             return {}
         elapsed_s = (now_ns - self._counting_since_ns) / 1e9
-        return {message_id: count / elapsed_s for message_id, count in self._counts.items()}
+        rates_hz = {message_id: count / elapsed_s for message_id, count in self._counts.items()}
+        beats_ns = self._heartbeats_ns
+        if len(beats_ns) > 1:  # too few in half of the time to be counted: their distances tell
+            rates_hz[_HEARTBEAT] = 1e9 * (len(beats_ns) - 1) / max(1, beats_ns[-1] - beats_ns[0])
+        return rates_hz
 
     def clock(self, now_ns: int) -> ClockSync | None:
         """Return what the autopilot's clock is against ours."""

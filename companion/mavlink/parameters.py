@@ -111,11 +111,13 @@ class ParameterServer:
     def answer(self, request: Request, now_ns: int) -> tuple[list[mavlink.MAVLink_message], str | None]:
         """Return what answers a request at once, and in words why a value was not set.
 
-        A list is sent by and by (`due`); asked for again while it is being sent, it begins anew.
+        A list is sent by and by (`due`). Asked for again meanwhile, what was sent already comes once more behind the
+        rest: whoever asks has it all in the end, and nobody who asks often can keep it from coming to its end.
         """
         names = self._names
         if request.message_id == PARAM_REQUEST_LIST:
-            self._waiting = deque(range(len(names)))
+            pending = set(self._waiting)
+            self._waiting.extend(index for index in range(len(names)) if index not in pending)
             return [], None
         if request.message_id == PARAM_REQUEST_READ:
             index = names.index(request.name) if request.name in names else request.index

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
 
+from pymavlink.dialects.v20 import ardupilotmega
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.sim.vehicle import Target, Vector3, VehicleState
@@ -81,6 +82,10 @@ class Snapshot:
         Jumps of the estimate so far, modulo 256.
     is_ardupilot
         Whose telemetry it is: ArduPilot's, else PX4's.
+    mission_seq
+        The mission item that is flown.
+    waypoint_ned_m
+        What POSITION_TARGET_GLOBAL_INT tells; None: it is not sent.
     """
 
     time_boot_us: int
@@ -93,6 +98,8 @@ class Snapshot:
     home_ned_m: Vector3
     reset_counter: int
     is_ardupilot: bool = False
+    mission_seq: int = 0
+    waypoint_ned_m: Vector3 | None = None
 
     @property
     def time_boot_ms(self) -> int:
@@ -234,19 +241,19 @@ def _sys_status(_: Snapshot) -> Any:
 
 
 def _home_position(s: Snapshot) -> Any:
-    lat, lon, alt_mm = _global_of(s.home_ned_m)
+    lat, lon, alt_mm = global_of(s.home_ned_m)
     return mavlink.MAVLink_home_position_message(
         lat, lon, alt_mm, *s.home_ned_m, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, s.time_boot_us
     )
 
 
 def _gps_global_origin(s: Snapshot) -> Any:
-    lat, lon, alt_mm = _global_of((0.0, 0.0, 0.0))
+    lat, lon, alt_mm = global_of((0.0, 0.0, 0.0))
     return mavlink.MAVLink_gps_global_origin_message(lat, lon, alt_mm, s.time_boot_us)
 
 
 def _global_position_int(s: Snapshot) -> Any:
-    lat, lon, alt_mm = _global_of(s.vehicle.position_ned_m)
+    lat, lon, alt_mm = global_of(s.vehicle.position_ned_m)
     vx, vy, vz = (max(-32768, min(32767, round(100 * v))) for v in s.vehicle.velocity_ned_m_s)
     height_mm = round(1000 * (s.home_ned_m[2] - s.vehicle.position_ned_m[2]))
     return mavlink.MAVLink_global_position_int_message(
@@ -255,7 +262,7 @@ def _global_position_int(s: Snapshot) -> Any:
 
 
 def _gps_raw_int(s: Snapshot) -> Any:
-    lat, lon, alt_mm = _global_of(s.vehicle.position_ned_m)
+    lat, lon, alt_mm = global_of(s.vehicle.position_ned_m)
     north, east, _ = s.vehicle.velocity_ned_m_s
     speed_cm_s = min(65534, round(100 * math.hypot(north, east)))
     course = _centidegrees(math.atan2(east, north))
@@ -287,6 +294,10 @@ def _estimator_status(s: Snapshot) -> Any:
     )
 
 
+def _ekf_status_report(_: Snapshot) -> Any:
+    return ardupilotmega.MAVLink_ekf_status_report_message(831, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0)
+
+
 def _battery_status(_: Snapshot) -> Any:
     cells = [16200] + [65535] * 9
     return mavlink.MAVLink_battery_status_message(0, 1, 1, 32767, cells, -1, -1, -1, 100)
@@ -296,8 +307,24 @@ def _system_time(s: Snapshot) -> Any:
     return mavlink.MAVLink_system_time_message(s.time_unix_us, s.time_boot_ms)
 
 
-def _mission_current(_: Snapshot) -> Any:
-    return mavlink.MAVLink_mission_current_message(0)
+def _mission_current(s: Snapshot) -> Any:
+    return mavlink.MAVLink_mission_current_message(s.mission_seq)
+
+
+def _position_target_global_int(s: Snapshot) -> Any:
+    """Return the waypoint, or None where nothing is sent: on the ground, and on PX4 in OFFBOARD."""
+    if s.waypoint_ned_m is None or s.landed is LandedState.ON_GROUND:
+        return None
+    lat, lon, alt_mm = global_of(s.waypoint_ned_m)
+    return mavlink.MAVLink_position_target_global_int_message(
+        s.time_boot_ms,
+        mavlink.MAV_FRAME_GLOBAL_INT,
+        3576 if s.is_ardupilot else 0,
+        lat,
+        lon,
+        alt_mm / 1e3,
+        *([0.0] * 8),
+    )
 
 
 def _autopilot_version(s: Snapshot) -> Any:
@@ -320,7 +347,7 @@ def _autopilot_version(s: Snapshot) -> Any:
     )
 
 
-def _global_of(position_ned_m: Vector3) -> tuple[int, int, int]:
+def global_of(position_ned_m: Vector3) -> tuple[int, int, int]:
     """Return latitude and longitude (1e-7 degrees) and altitude (mm) about a fixed origin."""
     north, east, down = position_ned_m
     lat_deg = _ORIGIN_LAT_DEG + north / _METRES_PER_DEGREE
@@ -343,7 +370,7 @@ class Stream:
     rate_hz
         Default rate; 0 is sent on request only.
     build
-        Makes the message.
+        Makes the message; None where there is nothing to send now.
     """
 
     message_id: int
@@ -371,7 +398,9 @@ STREAMS: dict[int, Stream] = {
         Stream(mavlink.MAVLINK_MSG_ID_BATTERY_STATUS, 0.5, _battery_status),
         Stream(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, 1.0, _system_time),
         Stream(mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, 1.0, _estimator_status),
+        Stream(ardupilotmega.MAVLINK_MSG_ID_EKF_STATUS_REPORT, 0.0, _ekf_status_report),
         Stream(mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, 1.0, _mission_current),
+        Stream(mavlink.MAVLINK_MSG_ID_POSITION_TARGET_GLOBAL_INT, 9.9, _position_target_global_int),
         Stream(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, 0.0, _gps_global_origin),
         Stream(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0.0, _autopilot_version),
     )

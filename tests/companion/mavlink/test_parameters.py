@@ -71,12 +71,17 @@ def test_a_list_comes_by_and_by_and_complete(server):
     assert max(map(len, portions)) <= 4
 
 
-def test_a_list_asked_for_again_begins_anew(server):
+def test_a_list_asked_for_again_and_again_comes_to_its_end_for_everybody(server):
     ask = request(mavlink.MAVLink_param_request_list_message(1, 191))
-    server.answer(ask, 0)
-    server.due()
-    server.answer(ask, 0)
-    assert sent(server.due())[0].param_index == 0
+    came = []
+    for _ in range(6):
+        server.answer(ask, 0)
+        came += [value.param_index for value in sent(server.due())]
+    assert set(came) == set(range(len(NAMES)))
+    while portion := server.due():
+        came += [value.param_index for value in sent(portion)]
+    last = came[-len(NAMES) - 4 :]  # whoever asked last has everything
+    assert set(last) == set(range(len(NAMES)))
 
 
 def test_one_is_read_by_name_and_by_index(server):

@@ -119,7 +119,7 @@ def provide_image(cache: Path, wheels: Path, *, project_wheel: str, mirror: str 
     require_tools(["debootstrap", "mke2fs"], log=log)
     system = _provide_system(cache, mirror=mirror, log=log)
     for old in cache.glob("disk-*"):
-        shutil.rmtree(old)
+        _remove(old)
     new = cache / "disk-new"
     root = new / "root"
     new.mkdir()
@@ -139,6 +139,16 @@ def provide_image(cache: Path, wheels: Path, *, project_wheel: str, mirror: str 
     return image
 
 
+def _remove(folder: Path) -> None:
+    """Remove a root folder; one that was given up half made may still have the host's /proc in it."""
+    mounted = [line.split()[1] for line in Path("/proc/self/mounts").read_text().splitlines()]
+    if inside := [point for point in mounted if Path(point).is_relative_to(folder)]:
+        raise VmError(
+            f"{folder} is left from before and has mounts in it; run: umount {' '.join(reversed(inside))}"
+        )
+    shutil.rmtree(folder)
+
+
 def _system_recipe() -> tuple[object, ...]:
     return SUITE, _PACKAGES
 
@@ -153,7 +163,7 @@ def _provide_system(cache: Path, *, mirror: str | None, log: Path) -> Path:
     if system.is_dir():
         return system
     for old in cache.glob("system-*"):
-        shutil.rmtree(old)
+        _remove(old)
     new = cache / "system-new"
     words = ["debootstrap", "--variant=minbase", f"--include={','.join(_PACKAGES)}", SUITE, str(new)]
     run([*NICE, *words, mirror or debian_mirror(SUITE)], log=log, what="the guest's system")

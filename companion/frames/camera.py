@@ -254,7 +254,7 @@ class _CaptureThread:
                 self._counts.undecodable += 1
                 self._judge.damaged(str(error))
                 captured = None
-            if captured is not None:
+            if captured is not None and not self._stopping.is_set():  # one left to itself has nothing to say
                 self._take(captured, capture)
             if reason := self._judge.overdue(self._clock.now_ns()):
                 return reason

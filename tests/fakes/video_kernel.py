@@ -84,6 +84,7 @@ class FakeKernel:
     def __init__(self, cameras: dict[str, FakeCamera], links: dict[str, str] | None = None) -> None:
         self.cameras = cameras
         self.links = links or {}
+        self.opened: list[FakeNode] = []
 
     def nodes(self) -> tuple[Node, ...]:
         return tuple(
@@ -96,7 +97,8 @@ class FakeKernel:
         if camera is None or camera.gone:
             raise OSError(errno.ENOENT, "No such file or directory")
         camera.opened += 1
-        return FakeNode(camera)
+        self.opened.append(FakeNode(camera))
+        return self.opened[-1]
 
 
 class FakeNode:

@@ -92,7 +92,7 @@ class V4l2Opener:
         """Open the node that was asked for where it is that camera, else the one that is."""
         path = self._wish.path
         try:
-            device = VideoDevice(self._kernel.open(path), path)
+            device = _device_at(self._kernel, path)
         except OSError as error:
             if (found := self._found_elsewhere()) is not None:
                 return found
@@ -121,7 +121,7 @@ class V4l2Opener:
         for node in self._kernel.nodes():
             device = None
             with contextlib.suppress(OSError, SourceError):
-                device = VideoDevice(self._kernel.open(node.path), node.path)
+                device = _device_at(self._kernel, node.path)
             if device is None:
                 continue
             if device.identity == self._known:
@@ -233,6 +233,16 @@ class V4l2Capture:
             self._buffers.queue(newest.index)
             newest = newer
         return newest
+
+
+def _device_at(kernel: Kernel, path: str) -> VideoDevice:
+    """Open a device; one that is no camera (USB cameras have a node for metadata) is closed again."""
+    node = kernel.open(path)
+    try:
+        return VideoDevice(node, path)
+    except BaseException:
+        node.close()
+        raise
 
 
 def _set_up(device: VideoDevice, wish: V4l2Wish) -> tuple[ActiveFormat, float | None]:

@@ -231,3 +231,7 @@ def test_a_camera_is_found_again_under_another_name():
     del kernel.cameras["/dev/video0"]
     with pytest.raises(SourceError, match="no such camera"):
         again()
+    kernel.cameras = {"/dev/video0": FakeCamera(capabilities=abi.CAP_STREAMING)}
+    with pytest.raises(SourceError, match="captures no video"):
+        again()
+    assert all(node.closed.is_set() for node in kernel.opened)

@@ -1,7 +1,12 @@
 """Calibration with rendered boards: what comes out is the camera that they were rendered by."""
 
+import contextlib
+import itertools
 import json
 import shutil
+import socket
+import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -14,6 +19,7 @@ from companion.calibrate.judge import doubts
 from companion.calibrate.solve import calibrate, coverage, view_errors_px
 from companion.cli import main
 from companion.errors import CompanionError
+from companion.frames.socket import frame_bytes
 from detector.camera_model import CameraModel
 from tests.fakes.board_views import BoardStudio, charuco_texture, chessboard_texture, poses
 
@@ -161,6 +167,45 @@ def test_a_live_camera_is_asked_for_still_and_different_views():
         True,
         False,
     ]
+
+
+@contextlib.contextmanager
+def held_before_a_camera(folder: Path, each_s: float):
+    """Serve the pictures of a folder as a camera would, each for some time, over and over; yield the source's URL."""
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.glob("*.png"))]
+    stopping = threading.Event()
+    listener = socket.create_server(("127.0.0.1", 0))
+    listener.settimeout(30)
+
+    def send() -> None:
+        with contextlib.suppress(OSError), listener.accept()[0] as connection:
+            for seq in itertools.count():
+                if stopping.wait(0.02):
+                    return
+                image = images[int(seq * 0.02 / each_s) % len(images)]
+                connection.sendall(frame_bytes(image, seq=seq, time_ns=time.monotonic_ns()))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield f"tcp:127.0.0.1:{listener.getsockname()[1]}"
+    finally:
+        stopping.set()
+        thread.join()
+        listener.close()
+
+
+def test_a_live_camera_is_calibrated_with_views_of_a_board_at_rest(folder, tmp_path, capsys):
+    out = tmp_path / "live.toml"
+    with held_before_a_camera(folder, 0.4) as url:
+        code = main(["calibrate", url, "--views", "8", "-o", str(out), "--json"])
+    said = capsys.readouterr()
+    result = json.loads(said.out)
+    assert result["views"] + result["left_out"] == 8
+    assert said.err.count("\n") == 8
+    assert "view 8 of 8; " in said.err
+    assert (code == 0) is out.exists() is (result["grade"] != "bad")
+    assert result["rms_px"] < 0.1
 
 
 def test_the_emptiest_place_is_where_nothing_was_seen(views):

@@ -106,6 +106,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from companion.clock import RealClock
     from companion.config import Config
     from companion.config_file import load_config
+    from companion.event_loop import loop_factory
     from companion.log import open_log
     from companion.service import Service
     from companion.systemd import ServiceNotifier
@@ -122,7 +123,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
     with open_log(config.log) as log:
         try:
-            asyncio.run(serve())
+            with asyncio.Runner(loop_factory=loop_factory(config.link.event_loop)) as runner:
+                runner.run(serve())
         except* CompanionError as group:
             failure = first_of(group)
             log.critical("service_failed", error=str(failure))

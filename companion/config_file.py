@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 import re
 import textwrap
 import tomllib
@@ -46,8 +47,7 @@ def load_config(path: str | Path) -> Config:
     table = parse_table(read_text(path), name=str(path))
     config = config_of(table, name=str(path))
     folder = path.absolute().parent
-    named = config.ground_station.parameters_file
-    tuned = folder / (named or f"{path.stem}.tuned.toml")
+    tuned = _tuned_file(config.ground_station.parameters_file, path)
     if tuned.exists():
         over = parse_table(read_text(tuned), name=str(tuned))
         config = config_of(merged(table, over), name=str(tuned))
@@ -64,6 +64,15 @@ def parse_config(text: str, *, name: str = "configuration") -> Config:
         With every fault of the text, one a line.
     """
     return config_of(parse_table(text, name=name), name=name)
+
+
+def _tuned_file(named: str, path: Path) -> Path:
+    """Return where a ground station's settings are kept: where it is named, else where the service may write."""
+    if named:
+        return path.absolute().parent / named
+    # A unit of systemd may write there and not beside its configuration (systemd.exec, StateDirectory=).
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    return (Path(state) if state else path.absolute().parent) / f"{path.stem}.tuned.toml"
 
 
 def merged(table: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

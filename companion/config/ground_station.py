@@ -21,7 +21,7 @@ class GroundStationConfig(Section):
     parameters_file: Annotated[
         str,
         Field(
-            description="File that keeps what a ground station has set; it is read after the configuration and wins. Empty: beside the configuration, companion.toml's is companion.tuned.toml."
+            description="File that keeps what a ground station has set; it is read after the configuration and wins. Empty: companion.tuned.toml for companion.toml, in the state directory that systemd gives the service (STATE_DIRECTORY), else beside the configuration."
         ),
     ] = ""
     plot_rate_hz: Annotated[

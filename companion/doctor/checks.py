@@ -222,12 +222,12 @@ def _camera(findings: Findings, config: Config) -> Iterator[Check]:
     elif camera.model_fault is not None:
         yield Check("vision", Level.OK, "the worker takes camera and detector settings")
     model = config.camera
-    if not model.file and "hfov_deg" not in model.model_fields_set:
+    if not model.file and model.hfov_deg == type(model)().hfov_deg:
         yield Check(
             "camera model",
             Level.WARN,
-            f"none; {model.hfov_deg:g} deg are assumed",
-            "directions are wrong by what the lens differs: calibrate, or set camera.hfov_deg",
+            f"no file; {model.hfov_deg:g} deg across, the default",
+            "directions are wrong by what the lens differs: `companion calibrate`, or set camera.hfov_deg",
         )
     else:
         yield Check("camera model", Level.OK, model.file or f"{model.hfov_deg:g} deg across")

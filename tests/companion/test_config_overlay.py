@@ -75,3 +75,14 @@ def test_it_may_be_read_by_people(tmp_path):
     write_overlay(tmp_path / "x.toml", {"guidance.max_step_m": 0.9})
     assert (tmp_path / "x.toml").stat().st_mode & 0o777 == 0o644
     assert tomllib.loads((tmp_path / "x.toml").read_text()) == {"guidance": {"max_step_m": 0.9}}
+
+
+def test_under_systemd_it_is_where_the_service_may_write(tmp_path, monkeypatch):
+    (tmp_path / "etc").mkdir()
+    (tmp_path / "state").mkdir()
+    (tmp_path / "etc" / "config.toml").write_text("")
+    monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path}/state:{tmp_path}/other")
+    write_overlay(tmp_path / "state" / "config.tuned.toml", {"guidance.max_step_m": 0.5})
+    config = load_config(tmp_path / "etc" / "config.toml")
+    assert config.guidance.max_step_m == 0.5
+    assert config.ground_station.parameters_file == str(tmp_path / "state" / "config.tuned.toml")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 
 import pytest
 
@@ -68,3 +69,9 @@ def test_what_was_left_out_of_the_file_stays_so():
     given = changed(Config(camera=CameraConfig(hfov_deg=80.0)), BY_NAME["VOID_MAX_STEP_M"], 1.0)
     assert "hfov_deg" in given.camera.model_fields_set
     assert "hfov_deg" not in changed(Config(), BY_NAME["VOID_MAX_STEP_M"], 1.0).camera.model_fields_set
+
+
+def test_the_documentation_names_each_with_its_default():
+    page = (Path(__file__).parents[2] / "docs" / "ground-station.md").read_text()
+    for setting in SETTINGS:
+        assert f"| `{setting.name}` | `{setting.key}` | {number_of(Config(), setting):g} |" in page

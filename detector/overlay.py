@@ -139,8 +139,10 @@ def headline(detection: Detection) -> str:
     if isinstance(detection, SinglePlane):
         words = "SINGLE PLANE"
     else:
-        name = "vanishing point" if detection.kind is DirectionKind.VANISHING_POINT else "lowest flow"
+        name = detection.kind.value.replace("_", " ")
         words = f"{name} at ({detection.x_px:.0f}, {detection.y_px:.0f})"
+    if detection.confidence is not None:
+        words += f", confidence {detection.confidence:.2f}"
     contact = detection.time_to_contact
     if contact is None:
         return f"{words}, time to contact unknown"

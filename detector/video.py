@@ -34,10 +34,13 @@ class Answered:
         The answer, its times and its baseline.
     tracks
         The N' vectors behind it; empty where no pair was looked at.
+    paint
+        Draws the answer on the frame, with lines of text; None: as :func:`detector.overlay.draw` does.
     """
 
     observation: Observation
     tracks: Tracks
+    paint: Callable[[NDArray[np.uint8], tuple[str, ...]], NDArray[np.uint8]] | None = None
 
     @property
     def result(self) -> PairResult:
@@ -55,7 +58,7 @@ def by_observer(params: DetectorParams, camera: CameraModel | None) -> FrameAnsw
     observer = VoidObserver(params, camera, detector=recorder)
 
     def answer(image: NDArray[np.uint8], time_ns: int, pose: CameraPose | None) -> Answered:
-        recorder.tracks = _no_tracks()
+        recorder.tracks = no_tracks()
         observation = observer.observe(image, time_ns, pose)
         return Answered(observation, recorder.tracks)
 
@@ -89,7 +92,7 @@ def by_fixed_step(params: DetectorParams, camera: CameraModel | None, step: int)
         if earlier is None:
             words = f"frame {len(kept)} of the first {step}"
             nothing = NoDetection(NoDetectionReason.NO_EARLIER_FRAME, words, Diagnostics())
-            return Answered(Observation(nothing, time_ns), _no_tracks())
+            return Answered(Observation(nothing, time_ns), no_tracks())
         frame, earlier_ns, earlier_pose = earlier
         rotation = translation = baseline_m = None
         if pose is not None and earlier_pose is not None:
@@ -111,7 +114,7 @@ class _Recorder:
 
     def __init__(self, detector: VoidDetector) -> None:
         self._detector = detector
-        self.tracks = _no_tracks()
+        self.tracks = no_tracks()
 
     def detect(
         self,
@@ -136,7 +139,8 @@ class _Recorder:
         self._detector.reset()
 
 
-def _no_tracks() -> Tracks:
+def no_tracks() -> Tracks:
+    """Return no flow vectors."""
     return Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
 
 
@@ -162,7 +166,10 @@ def annotated(image: NDArray[np.uint8], answered: Answered, number: int, time_s:
         words += f"  pair over {(observation.time_ns - observation.earlier_time_ns) * 1e-9:.2f} s"
     if observation.baseline_m is not None:
         words += f", {observation.baseline_m:.2f} m"
-    picture = draw(image, answered.result, zoom=legible_zoom(image.shape[1]), notes=(words,))
+    if answered.paint is not None:
+        picture = answered.paint(image, (words,))
+    else:
+        picture = draw(image, answered.result, zoom=legible_zoom(image.shape[1]), notes=(words,))
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 

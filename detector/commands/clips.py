@@ -223,10 +223,12 @@ def poses_of(clip: FolderClip) -> tuple[CameraModel | None, dict[str, CameraPose
     except DatasetError as error:
         raise InputError(inputs.one_line(f"{error} (--no-poses leaves it aside)")) from error
     poses: dict[str, CameraPose] = {}
+    level_from_world = known.level_from_world()
+    level = np.eye(3) if level_from_world is None else level_from_world
     for name, frame in known.frames.items():
         if frame.pose is not None:
             pose = np.array(frame.pose, np.float64)
-            poses[Path(name).name] = CameraPose(pose[:3, :3], pose[:3, 3])
+            poses[Path(name).name] = CameraPose(level @ pose[:3, :3], level @ pose[:3, 3])
     return known.camera, poses
 
 

@@ -72,6 +72,12 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="video to write (.mp4, .avi, .mkv, .mov, .webm)",
     )
     parser.add_argument("--json-lines", type=Path, metavar="FILE", help="write one JSON object a frame")
+    parser.add_argument(
+        "--method",
+        choices=("paper", "parallax"),
+        default="paper",
+        help="paper: flow clusters and lines; parallax: the void map, drawn too where poses are known (default: %(default)s)",
+    )
     inputs.add_params_arguments(parser)
     inputs.add_camera_arguments(parser)
     parser.add_argument(
@@ -104,6 +110,8 @@ def _run(options: argparse.Namespace) -> int:
     from detector.commands.clips import ClipWriter, FolderClip, open_clip, poses_of
 
     inputs.params_of(options)  # before anything is written
+    if options.method == "parallax" and options.baseline_frames is not None:
+        raise InputError("--baseline-frames: not with --method parallax, which chooses its pairs by distance")
     _refuse_overwriting(options.source, options.output)
     clip = open_clip(options.source, options.rate)
     camera: CameraModel | None = None
@@ -156,11 +164,14 @@ def _answers(
                 camera = inputs.camera_of(options, width_px, height_px)
                 if options.hfov is None and options.camera is None:
                     camera = known_camera
-                answer = (
-                    by_observer(params, camera)
-                    if options.baseline_frames is None
-                    else by_fixed_step(params, camera, options.baseline_frames)
-                )
+                if options.method == "parallax":
+                    from detector.parallax_video import by_parallax
+
+                    answer = by_parallax(camera)
+                elif options.baseline_frames is None:
+                    answer = by_observer(params, camera)
+                else:
+                    answer = by_fixed_step(params, camera, options.baseline_frames)
             pose = None if frame.name is None else poses.get(frame.name)
             yield number, frame, answer(frame.image, round(frame.time_s * 1e9), pose)
             advance()

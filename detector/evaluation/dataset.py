@@ -233,14 +233,21 @@ class ImageSet:
         return Motion(world_b[:3, :3].T @ world_a[:3, :3], world_a[:3, :3].T @ moved_m)
 
     def level_from_later(self, pair: Pair) -> NDArray[np.float64] | None:
-        """Return the rotation (3, 3) from a pair's later camera to a level frame with its z axis down; None where no pose is known.
+        """Return the rotation (3, 3) from a pair's later camera to a level frame with its z axis down; None where it is not known."""
+        pose, level_from_world = self.frames[pair.b].pose, self.level_from_world()
+        if pose is None or level_from_world is None:
+            return None
+        rotation: NDArray[np.float64] = level_from_world @ np.array(pose, np.float64)[:3, :3]
+        return rotation
+
+    def level_from_world(self) -> NDArray[np.float64] | None:
+        """Return the rotation (3, 3) from the poses' world to a level frame with its z axis down; None where no pose is known.
 
         Files do not say which way of their world is up. It is taken to be the axis of that world that the cameras' own vertical axes lie nearest to
         on average; None too where they lie near none (more than 40 degrees).
         """
-        pose = self.frames[pair.b].pose
         poses = [frame.pose for frame in self.frames.values() if frame.pose is not None]
-        if pose is None or not poses:
+        if not poses:
             return None
         below = np.mean([np.array(each, np.float64)[:3, 1] for each in poses], axis=0)
         axis = int(np.argmax(np.abs(below)))
@@ -248,9 +255,7 @@ class ImageSet:
             return None
         down, ahead = np.zeros(3), np.zeros(3)
         down[axis], ahead[(axis + 1) % 3] = np.sign(below[axis]), 1.0
-        level_from_world = np.stack([ahead, np.cross(down, ahead), down])
-        rotation: NDArray[np.float64] = level_from_world @ np.array(pose, np.float64)[:3, :3]
-        return rotation
+        return np.asarray(np.stack([ahead, np.cross(down, ahead), down]), np.float64)
 
     def focus_of(self, pair: Pair) -> tuple[float, float] | None:
         """Return the true focus of expansion in a pair's earlier frame: the file's, else that of the poses.

@@ -102,6 +102,26 @@ def test_poses_beside_the_images_are_used_unless_told_otherwise(capsys, clip, tm
     assert turned < 0.8 * plain, "the rotation is taken out"
 
 
+def test_the_parallax_method_draws_its_map_where_poses_are_known(capsys, clip, tmp_path):
+    add_poses(clip)
+    pictures = {}
+    for more in ((), ("--method", "parallax")):
+        out_file, lines = tmp_path / "o.mp4", tmp_path / "lines"
+        code, _, err = run(capsys, clip, "-o", out_file, "--json-lines", lines, "--limit", "2", *more)
+        assert (code, err) == (0, "")
+        pictures[more] = pictures_of(out_file)[1]
+    assert all(set(record) == KEYS for record in records_of(lines))
+    assert records_of(lines)[1]["kind"] in ("gap", "single_plane")
+    corner = pictures[("--method", "parallax")][-40:, -40:]
+    assert np.median(corner) > 200, "the map from above, on white"
+    assert np.median(pictures[()][-40:, -40:]) < 200
+    code, out, err = run(
+        capsys, clip, "-o", tmp_path / "n.mp4", "--method", "parallax", "--baseline-frames", "1"
+    )
+    assert (code, out) == (2, "")
+    assert "--baseline-frames" in err
+
+
 def test_a_folder_that_holds_its_images_in_a_folder_of_that_name(capsys, clip, tmp_path):
     walk = tmp_path / "walk"
     walk.mkdir()

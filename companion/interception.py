@@ -10,7 +10,7 @@ from companion.frames.source import Frame
 from companion.guidance.coordinates import heading_rad, quaternion_from_euler
 from companion.guidance.dialect import Ambiguous, Autopilot, Motion, NotUnderstood, Reading, understand
 from companion.guidance.engagement import Inputs
-from companion.guidance.geodesy import GlobalReference
+from companion.guidance.geodesy import Anchor, GlobalReference
 from companion.guidance.observation import DetectionReport, Pose
 from companion.guidance.pose_buffer import PoseBuffer
 from companion.guidance.setpoint import (
@@ -100,6 +100,8 @@ class Interception:
         self._asked_for_offboard_ns = _NEVER_NS
         self._was_ready = False
         self._off: str | None = None
+        self._clock_refused = False
+        self._watches_mission = False
         self._faults: dict[str, str] = {}
         self._estimator: tuple[int, int] | None = None
         self._report_waiting: DetectionReport | None = None
@@ -112,6 +114,10 @@ class Interception:
         """Return what is sent in place of a planner's setpoint of position or velocity."""
         if not self._is_planner(system_id, component_id):
             return Unprotected(f"from {system_id}/{component_id}, not the planner")
+        return self.treat(setpoint, system_id, component_id, now_ns)
+
+    def treat(self, setpoint: Setpoint, system_id: int, component_id: int, now_ns: int) -> Verdict:
+        """Return what is sent in place of a setpoint of whomever, the mission's goal included."""
         reading = understand(setpoint, self._autopilot())
         match reading:
             case NotUnderstood():
@@ -270,7 +276,11 @@ class Interception:
         if self._mode.offboard:
             self._asked_for_offboard_ns = _NEVER_NS
         armed = self._mode.armed or now_ns - self._asked_to_arm_ns <= _REQUEST_COUNTS_NS
-        offboard = self._mode.offboard or now_ns - self._asked_for_offboard_ns <= _REQUEST_COUNTS_NS
+        offboard = (
+            self._mode.offboard
+            or self._watches_mission
+            or now_ns - self._asked_for_offboard_ns <= _REQUEST_COUNTS_NS
+        )
         self.switch.on_vehicle(armed=armed, offboard=offboard, now_ns=now_ns, off=self._off)
         self.announce()
 
@@ -304,13 +314,27 @@ class Interception:
         if self._autopilot_heartbeat_ns is not None:  # before, an unknown mode is held
             self._tell_mode(now_ns)
 
+    @property
+    def reference(self) -> Anchor | None:
+        """Where local NED lies on the globe, where that is known."""
+        return self._reference.anchor
+
+    def watch_mission(self, on: bool, now_ns: int) -> None:
+        """Judge the way of the autopilot's own mission too, although no setpoint is followed there."""
+        if on != self._watches_mission:
+            self._watches_mission = on
+            self._tell_mode(now_ns)
+
     def on_estimator(self, flags: int, now_ns: int) -> None:
         """Take ESTIMATOR_STATUS.flags, or those of EKF_STATUS_REPORT."""
         self._estimator = (flags, now_ns)
 
     def on_clock(self, sync: ClockSync, now_ns: int) -> None:
         """Take what the autopilot's clock is against ours: poses are then as old as they are."""
-        self._poses.synchronise(sync.offset_ns, now_ns)
+        is_used = self._poses.synchronise(sync.offset_ns, now_ns)
+        if not is_used and self.switch.pose is not None and not self._clock_refused:
+            self._clock_refused = True
+            self._log.warning("clock_refused", offset_ns=sync.offset_ns, round_trip_ns=sync.round_trip_ns)
 
     def inputs(self, now_ns: int) -> Inputs:
         """Return what is known of everything that protection needs."""

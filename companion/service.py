@@ -8,12 +8,13 @@ vision         events     owns the worker process: start, deadline, restart (``v
 health         10 Hz      judges inputs, tells the switch S of failures, announces changes of state
 heartbeat      1 Hz       our HEARTBEAT, only while health has run
 component      10 Hz      our own component: answers that wait, TIMESYNC, plots, the computer's status
+takeover       20 Hz      flies where the mission's way is not free (``interception.mode = "takeover"`` only)
 settings       events     writes what a ground station has set to its file
 status         config     one line with all rates and ages
 systemd        1 Hz       feeds its watchdog, only while health has run; where it started us
 =============  =========  ==============================================================================
 
-Setpoints have no loop: they are decided and sent in the call that received them (``mavlink.proxy``).
+A planner's setpoints have no loop: they are decided and sent in the call that received them (``mavlink.proxy``).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from typing import Any, Final
 
+from companion.addressed import AddressedSetpoints
 from companion.clock import Clock
 from companion.config import Config
 from companion.errors import SourceError
@@ -38,10 +40,11 @@ from companion.mavlink.endpoint import Endpoint
 from companion.mavlink.endpoints import make_side
 from companion.mavlink.identity import Identity
 from companion.mavlink.network import Side
-from companion.mavlink.proxy import InlineProxy
-from companion.mavlink.signing import open_signatures
+from companion.mavlink.proxy import InlineProxy, OwnComponent
+from companion.mavlink.signing import Signatures, open_signatures
 from companion.own import Own
 from companion.systemd import ServiceNotifier
+from companion.takeover import TakeoverFlight
 from companion.vision.supervisor import VisionSupervisor
 
 _HEALTH_PERIOD_NS: Final = 100_000_000
@@ -138,13 +141,14 @@ class Service:
                 apply=self._apply,
                 signatures=signatures,
             )
+            takeover, tap = _way_of_interception(config, flight, identity, own, log, signatures)
             proxy = InlineProxy(
                 planner,
                 autopilot,
                 flight,
                 now_ns=clock.now_ns,
                 signatures=signatures,
-                own=own.component,
+                own=tap,
                 filters=config.link.filter_rules,
             )
 
@@ -163,6 +167,8 @@ class Service:
                 "settings": own.settings.keep(own.complain),
                 "status": self._status(flight, vision, proxy, own),
             }
+            if takeover is not None:
+                loops["takeover"] = takeover.run(clock)
             if self._notifier.enabled:
                 loops["systemd"] = self._tell_systemd(flight)
             log.info(
@@ -314,6 +320,32 @@ class Service:
                 links={link.name: link.status() for link in self._links},
                 **proxy.counters.as_dict(),
             )
+
+
+def _way_of_interception(
+    config: Config,
+    flight: Interception,
+    identity: Identity,
+    own: Own,
+    log: Log,
+    signatures: Signatures | None,
+) -> tuple[TakeoverFlight | None, OwnComponent]:
+    """Return what flies in place of the mission, where that is configured, and what the proxy offers frames to."""
+    match config.interception.mode:
+        case "takeover":
+            takeover = TakeoverFlight(
+                config,
+                flight,
+                identity,
+                log=log,
+                own=own.component,
+                engaged=lambda: own.engagement.engaged,
+            )
+            return takeover, takeover
+        case "addressed":
+            return None, AddressedSetpoints(flight, identity, own=own.component, signatures=signatures)
+        case "inline":
+            return None, own.component
 
 
 def _labels(links: Sequence[Endpoint]) -> str:

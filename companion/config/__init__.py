@@ -15,6 +15,7 @@ from companion.config.link import LinkConfig
 from companion.config.log import LogConfig
 from companion.config.section import Disagreement, DisagreementError, Section
 from companion.config.source import SourceConfig
+from companion.config.takeover import InterceptionConfig
 
 __all__ = [
     "CameraConfig",
@@ -25,6 +26,7 @@ __all__ = [
     "EngagementConfig",
     "GroundStationConfig",
     "GuidanceConfig",
+    "InterceptionConfig",
     "LinkConfig",
     "LogConfig",
     "SourceConfig",
@@ -39,6 +41,7 @@ class Config(Section):
     detector: DetectorConfig = DetectorConfig()
     link: LinkConfig = LinkConfig()
     guidance: GuidanceConfig = GuidanceConfig()
+    interception: InterceptionConfig = InterceptionConfig()
     engagement: EngagementConfig = EngagementConfig()
     ground_station: GroundStationConfig = GroundStationConfig()
     log: LogConfig = LogConfig()

@@ -198,6 +198,12 @@ class Identity:
         for endpoint in self._endpoints:
             endpoint.send(frame)
 
+    def send_to_autopilot(self, message: mavlink.MAVLink_message) -> None:
+        """Send a message as our own component to the autopilot's side alone: setpoints concern nobody else."""
+        frame = bytes(message.pack(self._encoder))
+        self._encoder.seq = (self._encoder.seq + 1) % 256
+        self._endpoints[1].send(frame if self._signatures is None else self._signatures.sign(frame))
+
 
 def heartbeat_message(state: MavState) -> mavlink.MAVLink_message:
     """Return our HEARTBEAT: an onboard controller, no autopilot."""

@@ -124,6 +124,8 @@ class ArduPilotController(Controller):
             home_ned_m=self._home,
             reset_counter=self._reset_counter,
             is_ardupilot=True,
+            mission_seq=self.mission.current,
+            waypoint_ned_m=self._waypoint(),
         )
 
     # ---- what can be asked of it ----
@@ -170,7 +172,9 @@ class ArduPilotController(Controller):
     def request_custom_mode(self, custom_mode: int, now_ns: int) -> Result:  # noqa: ARG002 - nothing here depends on time
         """Change the mode by its number."""
         mode = mode_from_number(custom_mode)
-        return Result.FAILED if mode is None else self.change_mode(mode)
+        if mode is None or (mode is CopterMode.AUTO and not self.mission.waypoints):
+            return Result.FAILED
+        return self.change_mode(mode)
 
     def request_takeoff(self, height_m: float, now_ns: int) -> Result:  # noqa: ARG002 - nothing here depends on time
         """Take off in GUIDED, armed and on the ground; the height is above home."""
@@ -249,6 +253,8 @@ class ArduPilotController(Controller):
         match self._mode:
             case CopterMode.GUIDED:
                 return self._fly_guided()
+            case CopterMode.AUTO:
+                return self._fly_mission()
             case CopterMode.LAND:
                 return Target((self._anchor[0], self._anchor[1], None), (0.0, 0.0, _LAND_SPEED_M_S))
             case CopterMode.RTL:
@@ -265,6 +271,22 @@ class ArduPilotController(Controller):
             rate = None if target.yaw_rate_rad_s is None else 0.0
             return dataclasses.replace(target, velocity_ned_m_s=(0.0, 0.0, 0.0), yaw_rate_rad_s=rate)
         return target
+
+    def _fly_mission(self) -> Target:
+        estimate = self.estimate
+        self.mission.advance(estimate.position_ned_m)
+        speed_m_s = float(self.parameters["WPNAV_SPEED"]) / 100.0
+        target = self.mission.target(estimate.position_ned_m, estimate.yaw_rad, speed_m_s)
+        return Target(self._anchor) if target is None else target
+
+    def _waypoint(self) -> Vector3 | None:
+        """Return what POSITION_TARGET_GLOBAL_INT tells: the waypoint, in GUIDED the setpoint read back."""
+        if self._mode is CopterMode.AUTO:
+            return self.mission.goal()
+        place = None if self._guided is None else self._guided.target.position_ned_m
+        if place is None or None in place:
+            return None
+        return place[0] or 0.0, place[1] or 0.0, place[2] or 0.0
 
     def _return(self) -> Target:
         north, east, down = self.estimate.position_ned_m

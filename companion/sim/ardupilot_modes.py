@@ -18,6 +18,7 @@ class CopterMode(Enum):
     """The modes that the fake autopilot flies: (number, base_mode bits without *armed*)."""
 
     STABILIZE = (0, _CUSTOM_MODE | _STABILIZED | _MANUAL_INPUT)
+    AUTO = (3, _WITH_POSITION)
     GUIDED = (4, _WITH_POSITION)
     LOITER = (5, _WITH_POSITION)
     RTL = (6, _WITH_POSITION)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Literal, Self
 
@@ -20,6 +20,7 @@ from companion.sim.controller import Controller
 from companion.sim.estimate_errors import ErringEstimate
 from companion.sim.flight_controller import FlightController
 from companion.sim.link_faults import FaultyLink, LinkFaults
+from companion.sim.mission import Mission
 from companion.sim.parameters import COPTER_DEFAULTS, ParameterTable
 from companion.sim.px4_modes import FlightMode
 from companion.sim.recorded_poses import RecordedPoses
@@ -252,6 +253,15 @@ class FakeAutopilot:
     def arm(self) -> Result:
         """Arm as the pilot would."""
         return self._controller.request_arm(self._clock.now_ns())
+
+    def set_mission(self, waypoints: Sequence[Vector3]) -> None:
+        """Give it a mission of waypoints in local NED (m), as if it had been uploaded."""
+        self._controller.mission = Mission(waypoints)
+
+    @property
+    def mission_seq(self) -> int:
+        """The mission item that is flown."""
+        return self._controller.mission.current
 
     def jump_estimate(self, jump_ned_m: Vector3) -> None:
         """Move the estimate at once, as an estimator reset does; ODOMETRY's reset counter counts it."""

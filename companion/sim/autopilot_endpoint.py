@@ -16,7 +16,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.guidance.setpoint import LocalSetpoint, Setpoint
 from companion.sim.commander import Result
 from companion.sim.controller import Controller
-from companion.sim.telemetry import STREAMS, StreamSchedule
+from companion.sim.mission import mission_count, mission_item
+from companion.sim.telemetry import ORIGIN_ALT_M, STREAMS, StreamSchedule, global_of
 from companion.sim.wire import FrameReader, FrameWriter, ReceivedFrame, global_setpoint, local_setpoint
 
 Address = tuple[str, int]
@@ -127,7 +128,8 @@ class AutopilotEndpoint:
         if now_ns < self._boot_until_ns or self.controller.crashed:
             return []
         snapshot = self.controller.snapshot()
-        messages = [STREAMS[i].build(snapshot) for i in self._schedule.due(snapshot.time_boot_us)]
+        built = [STREAMS[i].build(snapshot) for i in self._schedule.due(snapshot.time_boot_us)]
+        messages = [message for message in built if message is not None]
         while self.controller.texts:
             text = self.controller.texts.popleft()
             messages.append(mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_INFO, text.encode()[:50]))
@@ -167,10 +169,12 @@ class AutopilotEndpoint:
                 return self._set_parameter(message)
             case "MISSION_REQUEST_LIST":
                 return [
-                    mavlink.MAVLink_mission_count_message(
-                        frame.system_id, frame.component_id, 0, message.mission_type
+                    mission_count(
+                        self.controller.mission, frame.system_id, frame.component_id, message.mission_type
                     )
                 ]
+            case "MISSION_REQUEST_INT":
+                return [self._mission_item(frame)]
             case "MISSION_COUNT" | "MISSION_CLEAR_ALL":
                 empty = frame.name == "MISSION_CLEAR_ALL" or message.count == 0
                 result = mavlink.MAV_MISSION_ACCEPTED if empty else mavlink.MAV_MISSION_UNSUPPORTED
@@ -268,12 +272,26 @@ class AutopilotEndpoint:
         stream = STREAMS.get(message_id)
         if stream is None:
             return Result.UNSUPPORTED, []
-        return Result.ACCEPTED, [stream.build(self.controller.snapshot())]
+        message = stream.build(self.controller.snapshot())
+        return (Result.FAILED, []) if message is None else (Result.ACCEPTED, [message])
 
     def _reboot_on_command(self, wanted: float) -> Result:
         if wanted != 1.0:
             return Result.UNSUPPORTED
         return Result.DENIED if self.controller.armed else Result.ACCEPTED
+
+    def _mission_item(self, frame: ReceivedFrame) -> Any:
+        mission, seq = self.controller.mission, frame.message.seq
+        home_down_m = self.controller.snapshot().home_ned_m[2]
+        return mission_item(
+            mission,
+            seq,
+            global_of(mission.waypoints[seq]) if seq < len(mission.waypoints) else None,
+            ORIGIN_ALT_M - home_down_m,
+            system_id=frame.system_id,
+            component_id=frame.component_id,
+            mission_type=frame.message.mission_type,
+        )
 
     def _read_parameter(self, message: Any) -> list[Any]:
         names = self.controller.parameters.names()

@@ -115,6 +115,10 @@ class Commander:
         """Note that AUTO.TAKEOFF has reached its height: PX4 goes on in Hold."""
         self._intended = self.mode = FlightMode.HOLD
 
+    def mission_complete(self) -> None:
+        """Note that the last waypoint is reached: PX4 goes on in Hold."""
+        self._intended = self.mode = FlightMode.HOLD
+
     def update(self, now_ns: int, *, on_ground: bool, climbing: bool) -> list[str]:
         """Let time act: lost and regained offboard signal, disarming after landing.
 

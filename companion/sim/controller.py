@@ -13,6 +13,7 @@ from companion.guidance.setpoint import Setpoint
 from companion.sim.ardupilot_modes import CopterMode
 from companion.sim.commander import Result
 from companion.sim.estimate_errors import ErringEstimate
+from companion.sim.mission import Mission
 from companion.sim.offboard_input import Refusal
 from companion.sim.parameters import ParameterTable
 from companion.sim.px4_modes import FlightMode
@@ -59,6 +60,7 @@ class Controller(ABC):
         component_id: int,
         erring: ErringEstimate | None,
     ) -> None:
+        self.mission = Mission()
         self.parameters = parameters
         self.pilot_present = False
         self.crashed = ""

@@ -98,6 +98,8 @@ class FlightController(Controller):
             target=self._target,
             home_ned_m=self._home,
             reset_counter=self._reset_counter,
+            mission_seq=self.mission.current,
+            waypoint_ned_m=None if self.mode is FlightMode.OFFBOARD else self.mission.goal(),
         )
 
     def take_setpoint(self, setpoint: Setpoint, now_ns: int) -> Refusal | None:
@@ -117,6 +119,8 @@ class FlightController(Controller):
 
     def request_mode(self, mode: FlightMode, now_ns: int) -> Result:
         """Change the mode for a pilot, a ground station or a companion."""
+        if mode is FlightMode.MISSION and self.mission.is_complete:
+            return self._told(Answer(Result.TEMPORARILY_REJECTED, "No valid mission available"))
         return self._told(self._commander.request_mode(mode, now_ns))
 
     def request_mode_by_command(self, param2: int, param3: int, now_ns: int) -> Result:
@@ -177,7 +181,14 @@ class FlightController(Controller):
             on_ground=estimate.on_ground,
             offboard=self._offboard,
             pilot_present=self.pilot_present,
+            yaw_rad=estimate.yaw_rad,
+            mission=self.mission,
         )
+        if self.armed and self.mode is FlightMode.MISSION:
+            self.mission.advance(estimate.position_ned_m)
+            if self.mission.is_complete:
+                self._commander.mission_complete()
+                self.texts.append("Mission finished, loitering")
         self._target = self._navigator.target(situation)
         if self._replay is None:
             self._vehicle.step(dt_s, self._true_target(self._target))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from companion.sim.mission import Mission
 from companion.sim.parameters import ParameterTable
 from companion.sim.px4_modes import FlightMode
 from companion.sim.vehicle import Target, Vector3
@@ -32,6 +33,10 @@ class Situation:
         The last setpoint taken, if any.
     pilot_present
         Sticks centred. Without a pilot POSCTL sinks, as measured (4 m in 8 s).
+    yaw_rad
+        The estimated heading.
+    mission
+        What AUTO.MISSION flies.
     """
 
     mode: FlightMode
@@ -41,6 +46,8 @@ class Situation:
     on_ground: bool
     offboard: Target | None
     pilot_present: bool
+    yaw_rad: float
+    mission: Mission
 
 
 class Navigator:
@@ -91,6 +98,8 @@ class Navigator:
         match situation.mode:
             case FlightMode.OFFBOARD:
                 return situation.offboard if situation.offboard is not None else self._hold(situation)
+            case FlightMode.MISSION:
+                return self._fly_mission(situation)
             case FlightMode.HOLD:
                 return self._hold(situation)
             case FlightMode.TAKEOFF:
@@ -124,6 +133,11 @@ class Navigator:
             # Armed on the floor: hold must not lift it, whatever the estimator's noise.
             return Target((self._anchor[0], self._anchor[1], None), (0.0, 0.0, 0.1))
         return Target(self._anchor)
+
+    def _fly_mission(self, situation: Situation) -> Target:
+        speed_m_s = float(self._parameters["MPC_XY_CRUISE"])
+        target = situation.mission.target(situation.position_ned_m, situation.yaw_rad, speed_m_s)
+        return self._hold(situation) if target is None else target
 
     def _land(self, north_m: float, east_m: float) -> Target:
         self._landing = True

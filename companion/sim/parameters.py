@@ -25,6 +25,7 @@ _DEFAULTS: dict[str, int | float] = {
     "MIS_TAKEOFF_ALT": 2.5,
     "MPC_LAND_SPEED": 0.7,
     "MPC_TKO_SPEED": 1.5,
+    "MPC_XY_CRUISE": 5.0,
     "RTL_RETURN_ALT": 5.0,
     "SYS_AUTOSTART": 4001,
 }
@@ -35,6 +36,7 @@ COPTER_DEFAULTS: dict[str, int | float] = {
     "GUID_TIMEOUT": 3.0,
     "MAV_SYSID": 1,
     "RTL_ALT": 1500,
+    "WPNAV_SPEED": 1000,
 }
 """As ArduCopter 4.7-dev's."""
 

@@ -49,6 +49,8 @@ _COUNTED: Final = frozenset(
         EKF_STATUS_REPORT,
     }
 )
+_READ: Final = frozenset({streams.RC_CHANNELS, streams.ESTIMATOR_STATUS, EKF_STATUS_REPORT})
+"""Of the counted ones, those that are looked into."""
 _OF_AUTOPILOT: Final = frozenset({TIMESYNC, COMMAND_ACK}) | _COUNTED
 MESSAGE_IDS: Final = _REQUESTS | _OF_AUTOPILOT
 """What `OwnComponent.takes` looks at."""
@@ -157,23 +159,28 @@ class OwnComponent:
 
     def takes(self, frame: RawFrame, *, from_autopilot: bool, now_ns: int) -> bool:
         """Take one frame of `message_ids`; return whether it was for us alone and is not to be passed on."""
-        if frame.message_id in _REQUESTS:
+        message_id = frame.message_id
+        if message_id in _COUNTED:  # first: these are most of all frames
+            if not from_autopilot or not self._is_vehicles(frame):
+                return False
+            self._streams.count(message_id)
+            if message_id not in _READ:
+                return False
+        elif message_id in _REQUESTS:
             return self._request(frame, now_ns)
-        if not from_autopilot or not self._is_vehicles(frame):
+        elif not from_autopilot or not self._is_vehicles(frame):
             return False
         payload = frame.payload
-        if frame.message_id in _COUNTED:
-            self._streams.count(frame.message_id)
-        match frame.message_id:
-            case _ if frame.message_id == TIMESYNC:
+        match message_id:
+            case _ if message_id == TIMESYNC:
                 return self._clock(payload, now_ns)
-            case _ if frame.message_id == COMMAND_ACK:
+            case _ if message_id == COMMAND_ACK:
                 ours = (self._speaker.system_id, self._speaker.component_id)
                 return _ACK.unpack(payload.ljust(_ACK.size, b"\0")[: _ACK.size])[-2:] == ours
-            case _ if frame.message_id == RC_CHANNELS:
+            case _ if message_id == RC_CHANNELS:
                 values = _RC_CHANNELS.unpack(payload.ljust(_RC_CHANNELS.size, b"\0")[: _RC_CHANNELS.size])
                 self._listener.on_rc_channels(values[1 : 1 + min(18, values[19])], now_ns)
-            case message_id if message_id in FLAGS_AT:
+            case _ if message_id in FLAGS_AT:
                 at = FLAGS_AT[message_id]
                 self._listener.on_estimator(FLAGS.unpack_from(payload.ljust(at + 2, b"\0"), at)[0], now_ns)
         return False

@@ -80,9 +80,3 @@ class TimeSync:
             key=lambda sync: sync.round_trip_ns // 2 + int(_DRIFT * (now_ns - sync.at_ns)),
             default=None,
         )
-
-    def forget(self) -> None:
-        """Forget everything: the autopilot has restarted."""
-        self._asked.clear()
-        self._kept.clear()
-        self._last_boot_ns = None

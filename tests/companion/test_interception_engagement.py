@@ -79,3 +79,12 @@ def test_timesync_makes_poses_as_old_as_they_are():
     bench.flight.on_clock(ClockSync(offset, 80 * MS, bench.now), bench.now)
     bench.telemetry(0.3)
     assert bench.flight.status(bench.now)["pose_age_ms"] == late + 40
+
+
+def test_a_clock_that_is_not_the_autopilots_is_not_used_and_said_once():
+    bench = flying()
+    for _ in range(3):
+        bench.flight.on_clock(ClockSync(1_700_000_000 * SEC, MS, bench.now), bench.now)
+    assert len(bench.events("clock_refused")) == 1
+    bench.telemetry()
+    assert bench.flight.status(bench.now)["pose_age_ms"] == 0

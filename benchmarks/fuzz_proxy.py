@@ -123,6 +123,7 @@ def one_round(rng: random.Random, parts: int) -> tuple[list[str], float]:
         at += step
     # What a mutation left open at the end may still be waited for: a long quiet stretch ends the wait.
     source.receive(bytes(300))
+    whole += bytes(300)
     out = b"".join(sink.sent)
     if proxy.counters.handler_errors:
         faults.append(f"{proxy.counters.handler_errors} handler errors")

@@ -8,10 +8,14 @@ that only the message's definition tells (CRC_EXTRA). So two kinds of evidence a
   looks like a frame, complete or not, can hide, delay or swallow it. Where bytes that no checksum covers (an
   unknown frame, a signature) were taken for good too early, the verified frame that began in them still
   comes out.
-- A frame of an unknown message is accepted by its place: the walk behind it lands on the end of a datagram
+- A frame of an unknown message, without unknown incompatibility flags, is accepted by its place: the walk behind it lands on the end of a datagram
   or on another frame; or it stands directly behind a frame (or at the start of a datagram). In the second
   case it must name a sender that this peer's verified frames have named before; in the first such a one
   wins over one that does not.
+
+Sixteen bits of checksum are right by chance too: in a long burst of start markers one candidate does fit now and then. So
+a verified frame that stands behind garbage, and behind which nothing follows, does not win over one that begins in it.
+Where it stands in its place, it does: a frame may carry another one as its payload.
 
 A candidate of a known message with a wrong checksum is given up one byte at a time, so that a stray 0xFD or
 0xFE costs itself alone.
@@ -47,6 +51,12 @@ _CRC_EXTRA: Final[dict[int, bytes]] = {
     **{message_id: bytes([extra]) for message_id, extra in _NOT_IN_DIALECT.items()},
 }
 _MAGIC: Final = re.compile(rb"[\xfd\xfe]")
+_START: Final = re.compile(
+    rb"\xfd(?!.[^\x00\x01].{6}[^\x00])"  # unknown flags and an id above all that are known: see `_classify`
+    rb"|\xfe(?!\xfe{261})",  # a frame of nothing but 0xFE has a wrong checksum
+    re.DOTALL,
+)
+"""Start markers at which a frame can begin. Bursts of one marker (a line that floats) are passed over at the speed of this."""
 
 
 class RawFrame(NamedTuple):
@@ -144,6 +154,7 @@ class _Kind(IntEnum):
     VERIFIED = 1
     UNKNOWN = 2
     CORRUPT = 3
+    NOTHING = 4
 
 
 class _Candidate(NamedTuple):
@@ -156,6 +167,8 @@ class _Candidate(NamedTuple):
     """The walk behind it reaches a datagram's end or another frame's start."""
     hides_verified: bool
     """A verified frame starts inside it, where its own checksum does not cover (INCOMPLETE: anywhere)."""
+    is_doubtful: bool
+    """A verified frame starts inside its covered bytes, and the walk behind it reaches nothing."""
     hides_trusted: bool
     """An unknown frame that lands and names a known sender starts inside it."""
     hides_landing: bool
@@ -163,7 +176,11 @@ class _Candidate(NamedTuple):
 
 
 def _classify(buffer: bytes, start: int, size: int) -> tuple[_Kind, int, int]:
-    """Return kind, end and message id of the candidate at a start marker."""
+    """Return kind, end and message id of the candidate at a start marker.
+
+    An unknown message with unknown incompatibility flags is nothing: such a flag may change where the frame ends, and
+    receivers discard what carries one (https://mavlink.io/en/guide/serialization.html#incompat_flags).
+    """
     if buffer[start] == MAGIC_V2:
         payload = start + HEADER_V2
         if payload > size:
@@ -184,7 +201,8 @@ def _classify(buffer: bytes, start: int, size: int) -> tuple[_Kind, int, int]:
         return _Kind.INCOMPLETE, size, message_id
     extra = _CRC_EXTRA.get(message_id)
     if extra is None:
-        return _Kind.UNKNOWN, end, message_id
+        is_known_form = buffer[start] == MAGIC_V1 or buffer[start + 2] <= INCOMPAT_SIGNED
+        return (_Kind.UNKNOWN if is_known_form else _Kind.NOTHING), end, message_id
     crc = _crc(extra, _crc(buffer[start + 1 : covered_end], 0xFFFF))
     good = crc == buffer[covered_end] | buffer[covered_end + 1] << 8
     return _Kind.VERIFIED if good else _Kind.CORRUPT, end, message_id
@@ -215,6 +233,7 @@ class Framer:
     def __init__(self, counters: FramingCounters | None = None) -> None:
         self.counters = FramingCounters() if counters is None else counters
         self._held = b""
+        self._held_is_anchored = True
         self._senders: set[tuple[int, int]] = set()
         # Bytes from the first start marker on that was passed over inside uncovered bytes while the frame it
         # may begin was not complete; and how many of them were passed over so.
@@ -235,7 +254,8 @@ class Framer:
         position = self._look_back(datagram, len(buffer), frames) if self._passed else 0
         size = len(buffer)
         # The usual case, a walk over verified frames. Anything else is weighed with all that follows it.
-        while position < size and buffer[position] in (MAGIC_V1, MAGIC_V2):
+        anchored = not boundary or self._held_is_anchored
+        while anchored and position < size and buffer[position] in (MAGIC_V1, MAGIC_V2):
             kind, end, message_id = _classify(buffer, position, size)
             if kind is not _Kind.VERIFIED or (
                 buffer[position] == MAGIC_V2
@@ -247,7 +267,7 @@ class Framer:
             position = end
             self._passed = b""
         if position < size:
-            self._weigh(buffer, position, boundary, frames)
+            self._weigh(buffer, position, boundary, frames, anchored or position > 0)
         self.counters.frames += len(frames)
         for frame in frames:
             if frame.verified:
@@ -287,13 +307,17 @@ class Framer:
                 self._passed_over = watched_to - start
                 break
 
-    def _weigh(self, buffer: bytes, position: int, boundary: int, frames: list[RawFrame]) -> None:
-        """Append the frames from ``position`` on, where there is more than verified frames."""
+    def _weigh(
+        self, buffer: bytes, position: int, boundary: int, frames: list[RawFrame], anchored: bool
+    ) -> None:
+        """Append the frames from ``position`` on, where there is more than verified frames.
+
+        ``anchored``: the position is where a frame begins if all is well.
+        """
         size = len(buffer)
         senders = self._senders | {(f.system_id, f.component_id) for f in frames}
         candidates = _survey(buffer, position, boundary, senders)
         uncovered_from = position
-        anchored = True  # the position is where a frame begins if all is well
         for start, candidate in candidates.items():
             if start < position:
                 continue
@@ -304,7 +328,7 @@ class Framer:
             anchored = anchored or start == boundary
             match candidate.kind:
                 case _Kind.VERIFIED:
-                    accepted = not candidate.hides_verified
+                    accepted = not candidate.hides_verified and (anchored or not candidate.is_doubtful)
                 case _Kind.UNKNOWN:
                     trusted = _sender(buffer, start) in senders
                     accepted = (
@@ -312,12 +336,15 @@ class Framer:
                         and (trusted or not candidate.hides_trusted)
                         and (candidate.lands or (anchored and trusted and not candidate.hides_landing))
                     )
+                case _Kind.NOTHING:
+                    accepted = False
                 case _Kind.CORRUPT:
                     accepted = False
                     self.counters.crc_errors += candidate.lands and not candidate.hides_verified
                 case _Kind.INCOMPLETE:
                     if not (candidate.hides_verified or candidate.hides_trusted):
                         self._held = buffer[start:]
+                        self._held_is_anchored = anchored
                         break
                     accepted = False
             if accepted:
@@ -354,7 +381,7 @@ def _survey(
     size = len(buffer)
     candidates: dict[int, _Candidate] = {}
     next_verified = next_trusted = next_landing = size
-    starts = [match.start() for match in _MAGIC.finditer(buffer, position)]
+    starts = [match.start() for match in _START.finditer(buffer, position)]
     for start in reversed(starts):
         kind, end, message_id = _classify(buffer, start, size)
         behind = candidates.get(end)
@@ -367,10 +394,11 @@ def _survey(
             # The checksum speaks for all but a signature: a frame cut short there would swallow the next one.
             is_signed = buffer[start] == MAGIC_V2 and buffer[start + 2] & INCOMPAT_SIGNED
             hides_verified = bool(is_signed) and next_verified >= end - SIGNATURE_BYTES
+        is_doubtful = kind is _Kind.VERIFIED and not lands and next_verified < end
         candidates[start] = _Candidate(
-            kind, end, message_id, lands, hides_verified, next_trusted < end, next_landing < end
+            kind, end, message_id, lands, hides_verified, is_doubtful, next_trusted < end, next_landing < end
         )
-        if kind is _Kind.VERIFIED and not hides_verified:
+        if kind is _Kind.VERIFIED and not hides_verified and not is_doubtful:
             next_verified = start
         elif kind is _Kind.UNKNOWN and lands:
             next_landing = start

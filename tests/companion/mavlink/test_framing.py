@@ -253,3 +253,33 @@ def test_checksum_agrees_with_pymavlink():
     message = common.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 1.0)
     data = message.pack(common.MAVLink(None, 1, 1))
     assert checksum(data[1:-2], 30) == int.from_bytes(data[-2:], "little")
+
+
+@pytest.mark.parametrize(
+    "burst", [b"\xfd" * 65000, b"\xfe" * 65000, b"\xfd\xfe" * 32000, b"\xfe\xfd\xfd" * 20000]
+)
+def test_a_burst_of_start_markers_hides_nothing_behind_it_or_within(burst):
+    frames = [_known(84, bytes(range(1, 54)), seq, "v2") for seq in range(6)]
+    framer = Framer()
+    half = len(burst) // 2
+    got = framer.feed(frames[0] + burst[:half] + frames[1] + frames[2] + burst[half:] + frames[3])
+    got += framer.feed(burst[:1000])
+    got += framer.feed(frames[4] + frames[5])
+    assert _is_subsequence(frames, [f.data for f in got])
+
+
+def test_what_is_passed_over_at_a_glance_could_not_have_been_a_frame():
+    assert (
+        max(common.mavlink_map) < 1 << 16
+    )  # so that a third byte of the id that is not 0 means an unknown message
+    run = b"\xfe" * 262  # a start, a length of 254, the id 254, and a checksum
+    assert checksum(run[1:260], 254) != 0xFEFE
+    for tail in (b"", b"\x00", b"\x13\x37"):
+        assert Framer().feed(run + tail) == []
+
+
+def test_an_unknown_message_with_unknown_flags_is_garbage_as_every_receiver_treats_it():
+    frame = _v2(60000, b"\x01" * 20, 1, signed=False, extra=None, flags=0x04)
+    framer = Framer()
+    assert framer.feed(frame) == []
+    assert framer.counters.garbage_bytes == len(frame)

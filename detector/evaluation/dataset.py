@@ -75,7 +75,11 @@ class Depth(_Read):
 
 
 class Truth(_Read):
-    """What is known about a frame or a pair; None where it is not. ``wall_close`` also comes as the name of what closes the view."""
+    """What is known about a frame or a pair; None where it is not.
+
+    ``wall_close`` also comes as the name of what closes the view; ``free_distance_profile_m`` is how far the vehicle could fly in the direction of
+    equally wide columns, and goes before the depth of those columns, which knows nothing of the vehicle's size.
+    """
 
     vp: Point | None = None
     far_box: Box | None = None
@@ -84,6 +88,7 @@ class Truth(_Read):
     wall_close: bool | str | None = None
     wall_ahead: bool | None = None
     best_free_distance_m: Annotated[float, Field(ge=0)] | None = None
+    free_distance_profile_m: tuple[Annotated[float, Field(ge=0)] | None, ...] | None = None
     no_motion: bool | None = None
     time_to_contact_s: Finite | None = None
     depth: Depth | None = None

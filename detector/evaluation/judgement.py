@@ -233,9 +233,9 @@ def has_direction_truth(truth: Truth) -> bool:
 
 
 def profile_ratio(truth: Truth, x_px: float, width_px: int) -> float | None:
-    """Return the depth of a direction's column over that of the deepest one; None where its depth is not known."""
+    """Return how far a direction's column is free over the freest one's (:func:`_profile_m`); None where that is not known."""
     deepest_m = _deepest_m(truth)
-    at_m = _column_m(truth, x_px, width_px)
+    at_m = _column_m(_profile_m(truth), x_px, width_px)
     return None if deepest_m is None or at_m is None else at_m / deepest_m
 
 
@@ -305,14 +305,23 @@ def _in_boxes(point: tuple[float, float], truth: Truth) -> bool | None:
     return any(x0 <= point[0] <= x1 and y0 <= point[1] <= y1 for x0, y0, x1, y1 in boxes)
 
 
+def _profile_m(truth: Truth) -> tuple[float | None, ...]:
+    """Return how far the way is free by columns: for the vehicle where a world says so, else to what is seen there."""
+    if truth.free_distance_profile_m:
+        return truth.free_distance_profile_m
+    return _depths_m(truth)
+
+
+def _depths_m(truth: Truth) -> tuple[float | None, ...]:
+    return (None if truth.depth is None else truth.depth.column_profile_m) or ()
+
+
 def _deepest_m(truth: Truth) -> float | None:
-    profile = None if truth.depth is None else truth.depth.column_profile_m
-    known = [depth_m for depth_m in profile or () if depth_m is not None and depth_m > 0.0]
+    known = [free_m for free_m in _profile_m(truth) if free_m is not None and free_m > 0.0]
     return max(known) if known else None
 
 
-def _column_m(truth: Truth, x_px: float, width_px: int) -> float | None:
-    profile = None if truth.depth is None else truth.depth.column_profile_m
+def _column_m(profile: tuple[float | None, ...], x_px: float, width_px: int) -> float | None:
     if not profile:
         return None
     # Pixel centres have whole coordinates: the image reaches from -0.5 to width - 0.5.
@@ -367,5 +376,5 @@ def _contact_truth(
             return None
         along_axis_m = plane.dist_m / math.cos(math.radians(plane.normal_vs_axis_deg))
         return along_axis_m / forward_m, "plane"
-    at_m = None if point is None else _column_m(scene.truth, point[0], scene.image_size_px[0])
+    at_m = None if point is None else _column_m(_depths_m(scene.truth), point[0], scene.image_size_px[0])
     return None if at_m is None or at_m <= 0.0 else (at_m / forward_m, "column_profile_m")

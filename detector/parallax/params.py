@@ -88,7 +88,7 @@ class ParallaxParams(BaseModel):
             le=20,
             description="How far a given rotation may be wrong, an axis, one standard deviation. Larger: the flow decides more.",
         ),
-    ] = 0.3
+    ] = 0.2
     velocity_sigma_deg: Annotated[
         float,
         Field(gt=0, le=60, description="The same of a given direction of travel."),
@@ -109,7 +109,7 @@ class ParallaxParams(BaseModel):
             le=1000,
             description="Neighbouring samples share their windows, and lens and shutter bend the flow of whole regions: so many count as one where the motion is weighed against its priors. Larger: priors count more.",
         ),
-    ] = 40.0
+    ] = 60.0
     still_rad: Annotated[
         float,
         Field(

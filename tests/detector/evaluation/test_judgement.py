@@ -187,3 +187,10 @@ def test_lines_that_find_nothing_are_not_right():
     near = judge_lines("f", (50.0, 10.0), (10.0, 10.0), 400, 0.1)
     assert (near.within_tenth_width, near.error_width) == (True, pytest.approx(0.1))
     assert judge_lines("f", (51.0, 10.0), (10.0, 10.0), 400, 0.1).within_tenth_width is False
+
+
+def test_where_it_is_known_how_far_the_vehicle_can_fly_that_counts_and_not_the_depth():
+    # The deepest column is a slit that the vehicle does not fit through.
+    truth = Truth(depth=Depth(column_profile_m=(2.0, 9.0, 3.0)), free_distance_profile_m=(2.0, 1.5, 3.0))
+    assert profile_ratio(truth, 15.0, 30) == pytest.approx(0.5)
+    assert profile_ratio(truth, 25.0, 30) == pytest.approx(1.0)

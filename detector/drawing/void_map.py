@@ -166,7 +166,7 @@ def draw_map_from_above(
         for thickness, colour in ((5, BLACK), (2, WHITE)):
             cv2.arrowedLine(picture, place(0.0, 0.0), end, colour, thickness, cv2.LINE_AA, tipLength=0.06)
     cv2.circle(picture, place(0.0, 0.0), 5, INK, cv2.FILLED, cv2.LINE_AA)
-    words = "no answer" if gap is None else f"{gap.free_m:.1f} {unit}"
+    words = "no gap" if gap is None else f"{gap.free_m:.1f} {unit}"
     if confidence is not None:
         words += f", confidence {confidence:.2f}"
     put_text(picture, words, (8, size_px - 10), scale=0.5, colour=INK)

@@ -21,6 +21,7 @@ BINS: Final = 360
 """A full circle, one degree each; bin 0 points along the level frame's x axis, and azimuths grow to the right."""
 _HIT_SAMPLES: Final = 3
 _BIN_RAD: Final = math.tau / BINS
+_MEDIAN_HALF_BINS: Final = 1
 _SEEN_THROUGH: Final = 0.6
 """Quantile (of the inverse ranges about a direction, by weight) that is looked through to: a little nearer than the middle."""
 
@@ -96,7 +97,7 @@ class VoidMapParams(BaseModel):
             le=1,
             description="The answer is the middle of the directions that are free at least this share of the furthest. Larger: nearer to the furthest one.",
         ),
-    ] = 0.85
+    ] = 0.95
     smooth_deg: Annotated[
         float,
         Field(
@@ -104,7 +105,7 @@ class VoidMapParams(BaseModel):
             le=15,
             description="Half width over which the profile is smoothed to find the furthest direction. Larger: single bins matter less, narrow gaps are lost.",
         ),
-    ] = 2.0
+    ] = 4.0
     preference: Annotated[
         Literal["furthest", "least_deviation"],
         Field(
@@ -289,16 +290,24 @@ def gap_about(found: VoidMap, best: int, smooth: NDArray[np.float64], params: Vo
 
 
 def smoothed_profile(found: VoidMap, params: VoidMapParams) -> NDArray[np.float64]:
-    """Return the (M,) profile in which the furthest direction is looked for: medians over a few neighbouring bins, 0 where unknown."""
+    """Return the (M,) profile in which the furthest direction is looked for: smoothed over neighbouring bins, 0 where unknown."""
     return _smoothed(found, params)
 
 
 def _smoothed(found: VoidMap, params: VoidMapParams) -> NDArray[np.float64]:
+    """Return the profile without single wild bins (a median), rounded off, so that the middle of a gap stands out before its edges."""
+    free = np.where(found.known, found.free_m, 0.0)
     half = round(params.smooth_deg * BINS / 360.0)
     if half == 0:
-        return np.where(found.known, found.free_m, 0.0)
-    around = (np.arange(BINS)[:, None] + np.arange(-half, half + 1)[None, :]) % BINS
-    return np.where(found.known, np.median(np.where(found.known, found.free_m, 0.0)[around], axis=1), 0.0)
+        return free
+    free = np.median(free[_neighbours(min(half, _MEDIAN_HALF_BINS))], axis=1)
+    weight = half + 1.0 - np.abs(np.arange(-half, half + 1))
+    rounded = free[_neighbours(half)] @ (weight / weight.sum())
+    return np.where(found.known, rounded, 0.0)
+
+
+def _neighbours(half: int) -> NDArray[np.intp]:
+    return np.asarray((np.arange(BINS)[:, None] + np.arange(-half, half + 1)[None, :]) % BINS, np.intp)
 
 
 def _vouched(

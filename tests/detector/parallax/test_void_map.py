@@ -225,7 +225,7 @@ def test_the_furthest_gap_is_answered_in_its_middle() -> None:
     assert gap is not None
     assert math.degrees(gap.azimuth_rad) == pytest.approx(5.0, abs=1.0)
     assert gap.free_m == 7.0
-    assert math.degrees(gap.width_rad) == pytest.approx(21.0, abs=3.0)
+    assert 12.0 < math.degrees(gap.width_rad) < 24.0
 
 
 def test_a_gap_across_the_seam_of_the_circle_has_its_middle_there() -> None:

@@ -22,7 +22,15 @@ _ENOUGH_SAMPLES: Final = 40.0
 _ENOUGH_PROFILES: Final = 4.0
 _AROUND: Final = 3
 _WIDE_RAD: Final = math.radians(6.0)
-CALIBRATION: Final = ((0.25, 0.42), (0.38, 0.60), (0.55, 0.76), (0.75, 0.87), (0.9, 0.92), (1.0, 0.96))
+CALIBRATION: Final = (
+    (0.15, 0.30),
+    (0.26, 0.42),
+    (0.42, 0.66),
+    (0.62, 0.73),
+    (0.78, 0.80),
+    (0.94, 0.90),
+    (1.0, 0.93),
+)
 """Score, and the share of answers that were right there."""
 
 

@@ -269,6 +269,7 @@ class Switch:
         if state is State.TURN or (state is State.STEER and reason != GAP_SEEN):
             plan.begin_or_keep_episode(pose)
         if state is State.TURN:
+            self._evidence.gaps.forget()  # what led here was no way on
             plan.begin_turn(pose, now_ns)
         if state is State.PROBE:
             plan.begin_probe(pose, now_ns)

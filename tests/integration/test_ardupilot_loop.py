@@ -175,7 +175,7 @@ async def test_an_arducopter_is_turned_before_a_wall_and_loiter_by_the_pilot_win
         counts = loop.proxy.counters.as_dict()
         assert counts["handler_errors"] == 0
         assert counts["held"] > 10
-        assert counts["turned"] > 5
+        assert counts["turned"] > 0  # a turn ends early where a way is seen
         assert counts["substituted"] > 5
         assert (
             sum(counts[name] for name in ("forwarded", "substituted", "held", "turned"))

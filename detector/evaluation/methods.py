@@ -14,6 +14,7 @@ from detector import lines, vanishing_point
 from detector.camera_model import CameraModel
 from detector.expansion import fit_focus_of_expansion, ideal_px
 from detector.flow import Tracks
+from detector.parallax import line_vp
 from detector.parallax.flow_field import measure_flow
 from detector.parallax.params import ParallaxParams
 from detector.parallax.pipeline import Intrinsics, ParallaxDetector
@@ -103,7 +104,7 @@ class Method(Protocol):
 
 
 class _Lines:
-    """The line stage, which all methods share."""
+    """The paper's line stage, which the methods share but for ``parallax``."""
 
     def __init__(self, params: DetectorParams) -> None:
         self._params = params
@@ -145,6 +146,11 @@ class ParallaxMethod(_Lines):
     def __init__(self, params: DetectorParams) -> None:
         super().__init__(params)
         self._detector = ParallaxDetector(frame_params=params)
+
+    def vanishing_point(self, image: NDArray[np.uint8], /) -> tuple[float, float] | None:
+        """Return where whole-image segments meet (:mod:`detector.parallax.line_vp`)."""
+        found = line_vp.line_vanishing_point(image)
+        return None if found is None else (found.x_px, found.y_px)
 
     def answer(self, pair: PairInput, /) -> Answer:
         """Return the method's answer. What it says of the focus of expansion is estimated, also where it was told the motion: that is a prior."""

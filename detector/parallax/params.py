@@ -70,7 +70,7 @@ class ParallaxParams(BaseModel):
             le=10,
             description="A sample says something of its range where its flow along the epipolar line is known this well. Larger: weaker texture counts.",
         ),
-    ] = 0.5
+    ] = 0.8
     least_informative: Annotated[
         int,
         Field(

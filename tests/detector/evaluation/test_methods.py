@@ -145,3 +145,10 @@ def test_parallax_takes_what_it_is_told_and_says_where_the_focus_is():
     assert told.focus_px is not None  # estimated: what is told is a prior
     assert alone.focus_px is not None
     assert told.focus_px != alone.focus_px
+
+
+def test_the_lines_of_parallax_are_whole_image_segments():
+    found = METHODS["parallax"](PARAMS).vanishing_point(fan())
+    assert found is not None
+    assert np.hypot(found[0] - 355.0, found[1] - 245.0) < 6.0
+    assert METHODS["parallax"](PARAMS).vanishing_point(np.full((480, 640), 90, np.uint8)) is None

@@ -175,12 +175,14 @@ class MapMemory:
         self._newest.append(_Profile(found, *position_m, time_s))
 
     def _retire(self, profile: _Profile) -> None:
-        for other in list(self._older):
+        def is_another(other: _Profile) -> bool:
             near = math.dist((other.north_m, other.east_m), (profile.north_m, profile.east_m))
             shared = np.count_nonzero(other.found.known & profile.found.known)
-            if near < self._params.apart_m and shared >= 0.8 * np.count_nonzero(other.found.known):
-                self._older.remove(other)
-        self._older.append(profile)
+            return near >= self._params.apart_m or shared < 0.8 * np.count_nonzero(other.found.known)
+
+        kept = [other for other in self._older if is_another(other)]
+        self._older.clear()
+        self._older.extend([*kept, profile])
 
     def remembered(self, position_m: tuple[float, float], time_s: float) -> RememberedMap:
         """Return what the profiles say together, from a place at a time.

@@ -84,6 +84,16 @@ def test_a_turn_does_not_forget() -> None:
     assert not found.known[found.at(math.radians(-90.0))], "never seen"
 
 
+def test_a_vehicle_that_stays_keeps_room_for_what_it_saw_elsewhere() -> None:
+    memory = MapMemory(MapMemoryParams(kept=3, fade_distance_m=50.0, fade_s=600.0))
+    memory.add(box(5.0, half_view_deg=20, look_deg=90), (0.0, 0.0), 0.0)
+    for index in range(1, 30):
+        memory.add(box(5.0, half_view_deg=20), (0.0, 0.001 * index), 0.1 * index)
+    found = memory.remembered((0.0, 0.03), 3.0).found
+    assert found.known[found.at(0.0)]
+    assert found.known[found.at(math.radians(90.0))], "seen once, before all the others"
+
+
 def test_it_fades_with_distance_and_with_age() -> None:
     memory = MapMemory(MapMemoryParams(fade_distance_m=0.5, fade_s=2.0))
     memory.add(box(20.0), (0.0, 0.0), 0.0)

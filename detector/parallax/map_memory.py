@@ -178,7 +178,8 @@ class MapMemory:
         def is_another(other: _Profile) -> bool:
             near = math.dist((other.north_m, other.east_m), (profile.north_m, profile.east_m))
             shared = np.count_nonzero(other.found.known & profile.found.known)
-            return near >= self._params.apart_m or shared < 0.8 * np.count_nonzero(other.found.known)
+            known = np.count_nonzero(other.found.known)
+            return near >= self._params.apart_m or bool(shared < 0.8 * known)
 
         kept = [other for other in self._older if is_another(other)]
         self._older.clear()

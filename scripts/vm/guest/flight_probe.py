@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+import time
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from functools import partial
 
@@ -27,6 +29,7 @@ _CAMERA_EVENTS = frozenset(
 
 
 _TRIES = 10
+_ON_ITS_WAY_S = 30.0
 _POSE_HZ = 10.0
 _LOSS_S = 20.0
 _STATION_ID = 254  # not the planner's: its messages are none of those that are compared
@@ -50,9 +53,22 @@ def on_event(event: dict) -> None:
         say("event", **{key: value for key, value in event.items() if key != "phase"})
 
 
+async def arrived(frame: bytes, received: list[bytes]) -> None:
+    """Wait until a frame has come, and with it, on one link in order, all before it; and a little for the other way."""
+    end_s = time.monotonic() + _ON_ITS_WAY_S
+    while frame not in received[-500:] and time.monotonic() < end_s:  # noqa: ASYNC110  the planner's list tells nobody
+        await asyncio.sleep(0.2)
+    await asyncio.sleep(3.0)
+
+
+def message_id(frame: bytes) -> int:
+    """Return the message's number in a frame of MAVLink 2."""
+    return int.from_bytes(frame[7:10], "little")
+
+
 def is_answer(frame: bytes) -> bool:
     """Whether a MAVLink 2 frame answers somebody: the service asks the autopilot too, and has what answers it."""
-    return int.from_bytes(frame[7:10], "little") in _ANSWERS
+    return message_id(frame) in _ANSWERS
 
 
 async def slow_down(autopilot: FakeAutopilot) -> None:
@@ -110,11 +126,11 @@ async def fly(node: str) -> None:
                 await loop.run_in_executor(None, sys.stdin.readline)
                 mode, armed = str(planner.mode), planner.armed
                 planner.stop_streaming()
-                last, last_down = len(planner.sent_frames), len(autopilot.sent_frames)
-                await asyncio.sleep(3.0)  # what is on its way arrives
                 up, down = planner.sent_frames, autopilot.sent_frames
+                last, last_down = len(up), len(down)
                 meanwhile = down[first_down:last_down]
                 judged = [frame for frame in meanwhile if not is_answer(frame)]
+                await arrived(judged[-1], planner.received_frames)
                 answers = [frame for frame in meanwhile if is_answer(frame)]
                 traffic = compare(
                     up[first:last],
@@ -123,9 +139,19 @@ async def fly(node: str) -> None:
                     planner.received_frames,
                     not_judged=[*up[:first], *up[last:], *down[:first_down], *down[last_down:], *answers],
                 )
+                missing = Counter(judged) - Counter(planner.received_frames)
+                kinds = Counter(message_id(frame) for frame in missing.elements())
                 code = await service.stop()
                 totals = {name: getattr(traffic, name) for name in traffic.__slots__}
-                say("done", code=code, mode=mode, armed=armed, other_lines=service.other_lines[-5:], **totals)
+                say(
+                    "done",
+                    code=code,
+                    mode=mode,
+                    armed=armed,
+                    missing_down=kinds,
+                    other_lines=service.other_lines[-5:],
+                    **totals,
+                )
 
 
 def main() -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -28,6 +29,7 @@ read the output: docs/vm-test.md."""
 def main() -> int:
     """Run it and return the exit code: 0 all passed, 1 something failed, 2 the machine could not be tried."""
     arguments = _parser().parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that QEMU ends with it
     try:
         results = _try(arguments)
     except VmError as error:

@@ -392,7 +392,14 @@ def _first_hits(
         centre[last:] <= (1.0 + params.hit_share) * centre[:-last]
     )
     met, at = np.unique(bin_number[:-last][agree], return_index=True)
-    middle = np.flatnonzero(agree)[at] + 1
+    nearest = np.flatnonzero(agree)[at]
+    # The first three are the nearest of many with noise: the surface is the middle of those about them.
+    row_ends = np.searchsorted(bin_number, met, "right")
+    about = [
+        np.searchsorted(centre[begin:end], (1.0 + params.hit_share) * centre[begin], "right")
+        for begin, end in zip(nearest, row_ends, strict=True)
+    ]
+    middle = nearest + np.asarray(about, np.intp) // 2
     hits[met] = distance[middle]
     spread[met] = sigma[member[middle]] / math.sqrt(_HIT_SAMPLES)
     return hits, spread

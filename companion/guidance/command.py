@@ -13,9 +13,11 @@ from companion.guidance.situation import Evidence, Situation, remaining_m
 from companion.guidance.table import LOOK_AGAIN, State, Table
 from companion.guidance.wish import Wish
 
-_NARROW_M = 0.6
-_NARROW_STEP_M = 0.8
-"""Longest step where something is remembered this near beside the way: slower between the jambs of a door."""
+_ROOMY_M = 0.8
+"""With this much room beside the way nothing remembered there limits the step."""
+_NO_ROOM_M = 0.3
+_STEP_PER_ROOM = 2.0
+_LEAST_STEP_M = 0.3
 _COMMAND_RECENT_NS = 500_000_000
 _MAX_SLEW_DT_S = 0.2
 _MAX_YAW_LEAD_RAD = math.radians(30.0)
@@ -116,7 +118,7 @@ class Command:
             return self._follow(s)
         if state is State.STEER and s.gap is not None:
             psi, room_m = self._evidence.seen.clearer(s.gap.azimuth_rad(s.pose), s.pose, s.now_ns)
-            longest_m = min(s.gap.left_m(s.pose), _NARROW_STEP_M if room_m < _NARROW_M else math.inf)
+            longest_m = min(s.gap.left_m(s.pose), _longest_beside(room_m))
             return self._steer(s, psi, self._evidence.free_m(psi, s.pose, s.now_ns), longest_m)
         if state is State.STEER and s.answer is not None:
             return self._steer(s, s.answer.azimuth_rad, self._evidence.void_free_m(s.answer, s))
@@ -157,7 +159,8 @@ class Command:
         if s.reached:
             step_m, wanted_yaw = min(s.goal_m, self._config.max_step_m), wish.yaw_rad
         else:
-            step_m = self._step_m(s.goal_m, self._free_to_goal_m(s))
+            _, room_m = self._evidence.seen.clearer(s.bearing_rad, s.pose, s.now_ns)
+            step_m = min(self._step_m(s.goal_m, self._free_to_goal_m(s)), _longest_beside(room_m))
             if self._table.choose(s)[1] == LOOK_AGAIN:
                 step_m = 0.0
             wanted_yaw = s.bearing_rad - self._camera_yaw_rad
@@ -233,3 +236,10 @@ class Command:
         yaw = self.yaw.toward(yaw_rad, s.pose, s.now_ns) if slewed is None else slewed
         self.yaw.commanded(yaw, s.now_ns)
         return Rewrite(x, y, yaw, action, down_m)
+
+
+def _longest_beside(room_m: float) -> float:
+    """Return the longest step where something is remembered this near beside the way: slow past a corner or a jamb."""
+    if room_m >= _ROOMY_M:
+        return math.inf
+    return max(_LEAST_STEP_M, _STEP_PER_ROOM * (room_m - _NO_ROOM_M))

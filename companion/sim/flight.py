@@ -34,7 +34,7 @@ Method = Literal["paper", "parallax", "off"]
 PlannerKind = Literal["waypoints", "mavsdk"]
 """``waypoints``: ``companion.sim.planner``. ``mavsdk``: an unmodified mavsdk client, in real time only."""
 
-_DIRECTIONS = ("vanishing_point", "lowest_flow")
+_DIRECTIONS = ("gap", "vanishing_point", "lowest_flow")
 _SECTOR_STEP_RAD = math.radians(3.0)
 
 
@@ -318,7 +318,7 @@ def free_ratios(spec: FlightSpec, place: Place, record: FlightRecord) -> list[fl
         record.answer_px.tolist(),
         strict=True,
     ):
-        if kind not in _DIRECTIONS or frame_s < 0.0:
+        if kind not in _DIRECTIONS or frame_s < 0.0 or not math.isfinite(x_px):
             continue
         sample = record.sample_at(frame_s)
         north, east, down = record.position_ned_m[sample].tolist()

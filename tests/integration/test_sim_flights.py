@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.sim.estimate_errors import EstimateErrors
-from companion.sim.flight import FlightSpec, fly, judged, place_of
+from companion.sim.flight import FlightSpec, Method, fly, judged, place_of
 from companion.sim.scene import room_with_wall
 from tests.fakes.ray_cast_place import ray_cast_place
 
@@ -54,6 +54,17 @@ def test_the_service_flies_in_the_rendered_worlds(world: str):
     assert (np.linalg.norm(sent - planned, axis=1) > 1.0).any(), "the service is in the way"
     # z is the planner's, bit for bit, whatever the service did with the rest
     assert set(sent[:, 2].tolist()) == {float(np.float32(place.goal_ned_m[2]))}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["paper", "parallax"])
+def test_a_doorway_that_is_not_on_the_straight_line_is_flown_through(method: Method):
+    spec = FlightSpec(world="door", seed=2, method=method, time_limit_s=30.0)
+    place = place_of(spec)
+    result = judged(spec, place, fly(spec, place))
+    assert result.collisions == 0
+    assert result.goal_distance_m < 4.0, "the wall with the door is 4.5 m before the goal"
+    assert result.free_ratio_median is not None
 
 
 @pytest.mark.slow

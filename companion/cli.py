@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -39,11 +40,15 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "-c", "--config", metavar="FILE.toml", help="configuration; without it the defaults hold"
     )
+    run.add_argument(
+        "-o",
+        "--option",
+        metavar="TABLE.KEY=VALUE",
+        action="append",
+        default=[],
+        help="one value in place of what the files and the environment say; may be repeated",
+    )
     run.set_defaults(command=_run)
-
-    config = commands.add_parser("config", help="print a configuration")
-    config.add_argument("--default", action="store_true", required=True, help="the commented default file")
-    config.set_defaults(command=_config)
 
     check = commands.add_parser("check-config", help="say whether a configuration file can be used")
     check.add_argument("file", metavar="FILE.toml")
@@ -62,11 +67,18 @@ def _parser() -> argparse.ArgumentParser:
     demo.set_defaults(command=_demo)
 
     # Their command lines are their own (``_OWN_PARSERS``); here they are for the list of commands.
+    commands.add_parser("config", help="print a configuration: in force, default, its schema", add_help=False)
     commands.add_parser("sim", help="fly closed loop in a simulated indoor world", add_help=False)
     commands.add_parser("cameras", help="list cameras, take a picture, measure their timing", add_help=False)
     commands.add_parser("doctor", help="say what is missing before a flight, and what to do", add_help=False)
     commands.add_parser("calibrate", help="make or judge a camera file with a board", add_help=False)
     return parser
+
+
+def _config_parser() -> argparse.ArgumentParser:
+    from companion.config_command import config_parser
+
+    return config_parser()
 
 
 def _sim_parser() -> argparse.ArgumentParser:
@@ -94,6 +106,7 @@ def _calibrate_parser() -> argparse.ArgumentParser:
 
 
 _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
+    "config": _config_parser,
     "sim": _sim_parser,
     "cameras": _cameras_parser,
     "doctor": _doctor_parser,
@@ -104,15 +117,17 @@ _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
 
 def _run(arguments: argparse.Namespace) -> int:
     from companion.clock import RealClock
-    from companion.config import Config
-    from companion.config_file import load_config
+    from companion.config_sources import ConfigPlaces, load
     from companion.event_loop import loop_factory
     from companion.log import open_log
     from companion.service import Service
     from companion.systemd import ServiceNotifier
 
     notifier = ServiceNotifier.from_environment()  # before anything is started that could inherit it
-    config = load_config(arguments.config) if arguments.config else Config()
+    places = ConfigPlaces(
+        Path(arguments.config) if arguments.config else None, dict(os.environ), tuple(arguments.option)
+    )
+    config = load(places).config
 
     async def serve() -> None:
         service = Service(config, clock=RealClock(), log=log, notifier=notifier)
@@ -134,21 +149,13 @@ def _run(arguments: argparse.Namespace) -> int:
     return return_code
 
 
-def _config(arguments: argparse.Namespace) -> int:
-    from companion.config_file import default_toml
-
-    if arguments.default:
-        print(default_toml(), end="")
-    return 0
-
-
 def _check_config(arguments: argparse.Namespace) -> int:
     from companion.clock import RealClock
-    from companion.config_file import load_config
+    from companion.config_sources import ConfigPlaces, load
     from companion.log import open_log
     from companion.vision.supervisor import VisionSupervisor
 
-    config = load_config(arguments.file)
+    config = load(ConfigPlaces(Path(arguments.file), dict(os.environ))).config
     with open_log(config.log) as log:
         # The camera file and the detector's parameters are the worker's to read: one is started for it.
         supervisor = VisionSupervisor(

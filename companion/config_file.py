@@ -2,57 +2,29 @@
 
 All faults of a file are reported at once, one a line, each with the file, the key, what was found and
 what is allowed. The default file and those messages are made from the models in ``companion.config``.
+Where values come from, and in which order, is in ``companion.config_sources``.
 """
 
 from __future__ import annotations
 
 import difflib
 import json
-import os
 import re
 import textwrap
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from companion.config import CameraConfig, Config, DetectorConfig, DisagreementError, LinkConfig, SourceConfig
+from companion.config import Config, DisagreementError
 from companion.errors import ConfigError
 
 _MAX_FILE_BYTES = 1 << 20
 _MAX_SHOWN = 60
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-
-
-def load_config(path: str | Path) -> Config:
-    """Read a configuration file.
-
-    Relative paths in it (``source.url`` of a file, ``camera.file``, ``detector.params_file``, ``link.signing_key_file``) are taken as relative
-    to the file's own folder. What a ground station has set (``ground_station.parameters_file``) is read after it and wins.
-
-    Parameters
-    ----------
-    path
-        A TOML file. Keys that it leaves out have their defaults.
-
-    Raises
-    ------
-    companion.errors.ConfigError
-        With every fault of the file, one a line.
-    """
-    path = Path(path)
-    table = parse_table(read_text(path), name=str(path))
-    config = config_of(table, name=str(path))
-    folder = path.absolute().parent
-    tuned = _tuned_file(config.ground_station.parameters_file, path)
-    if tuned.exists():
-        over = parse_table(read_text(tuned), name=str(tuned))
-        config = config_of(merged(table, over), name=str(tuned))
-    station = config.ground_station.model_copy(update={"parameters_file": str(tuned)})
-    return _resolve_paths(config.model_copy(update={"ground_station": station}), folder)
 
 
 def parse_config(text: str, *, name: str = "configuration") -> Config:
@@ -66,15 +38,6 @@ def parse_config(text: str, *, name: str = "configuration") -> Config:
     return config_of(parse_table(text, name=name), name=name)
 
 
-def _tuned_file(named: str, path: Path) -> Path:
-    """Return where a ground station's settings are kept: where it is named, else where the service may write."""
-    if named:
-        return path.absolute().parent / named
-    # A unit of systemd may write there and not beside its configuration (systemd.exec, StateDirectory=).
-    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-    return (Path(state) if state else path.absolute().parent) / f"{path.stem}.tuned.toml"
-
-
 def merged(table: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables of a configuration with another's keys in place of the same ones of it."""
     both = dict(table)
@@ -84,8 +47,15 @@ def merged(table: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return both
 
 
-def config_of(table: Mapping[str, Any], *, name: str) -> Config:
-    """Return the configuration that a parsed file holds; ``name`` stands in messages for the file.
+def config_of(table: Mapping[str, Any], *, name: str | Callable[[str], str]) -> Config:
+    """Return the configuration that a parsed file holds.
+
+    Parameters
+    ----------
+    table
+        What the file holds, or several of them merged.
+    name
+        Stands in messages for the file; of several, what says which one a dotted key comes from.
 
     Raises
     ------
@@ -95,8 +65,9 @@ def config_of(table: Mapping[str, Any], *, name: str) -> Config:
     try:
         return Config.model_validate(table)
     except ValidationError as error:
-        lines = [line for details in error.errors() for line in _fault_lines(details, table)]
-        raise ConfigError("\n".join(f"{name}: {line}" for line in lines)) from error
+        faults = [fault for details in error.errors() for fault in _faults(details, table)]
+        named = [(name if isinstance(name, str) else name(key), line) for key, line in faults]
+        raise ConfigError("\n".join(f"{place}: {line}" for place, line in named)) from error
 
 
 def default_toml() -> str:
@@ -105,7 +76,7 @@ def default_toml() -> str:
         "# Configuration of the void companion. Every key is optional; the values here are the defaults.\n",
         "# Relative paths are relative to this file's folder.\n",
     ]
-    for section, schema in _section_schemas().items():
+    for section, schema in section_schemas().items():
         parts.append(f"\n{_comment(schema['description'])}[{section}]\n")
         for key, facts in schema["properties"].items():
             default = toml_value(facts.get("default", []))
@@ -162,25 +133,8 @@ def parse_table(text: str, *, name: str) -> dict[str, Any]:
         raise ConfigError(f"{name}: not valid TOML: nested too deeply") from error
 
 
-def _resolve_paths(config: Config, folder: Path) -> Config:
-    def resolved(value: str) -> str:
-        return str(folder / value) if value else value
-
-    source: SourceConfig = config.source
-    if source.scheme == "file":
-        source = source.model_copy(update={"url": f"file:{resolved(source.where)}"})
-    camera: CameraConfig = config.camera.model_copy(update={"file": resolved(config.camera.file)})
-    detector: DetectorConfig = config.detector.model_copy(
-        update={"params_file": resolved(config.detector.params_file)}
-    )
-    link: LinkConfig = config.link.model_copy(
-        update={"signing_key_file": resolved(config.link.signing_key_file)}
-    )
-    return config.model_copy(update={"source": source, "camera": camera, "detector": detector, "link": link})
-
-
-def _section_schemas() -> dict[str, dict[str, Any]]:
-    """Return the JSON schema of each section, by its name in the file."""
+def section_schemas() -> dict[str, dict[str, Any]]:
+    """Return the JSON schema of each section, by its name in the file; keys in the order of the models."""
     schema = Config.model_json_schema()
     return {
         section: schema["$defs"][facts["$ref"].rpartition("/")[2]]
@@ -188,28 +142,35 @@ def _section_schemas() -> dict[str, dict[str, Any]]:
     }
 
 
-def _fault_lines(details: ErrorDetails, table: Mapping[str, Any]) -> list[str]:
-    """Return one line a fault, without the file's name."""
+def _faults(details: ErrorDetails, table: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the dotted key and one line of each fault, without the file's name."""
     loc = tuple(str(part) for part in details["loc"])
     raised = details.get("ctx", {}).get("error")
     if isinstance(raised, DisagreementError):
         return [
-            f"{_dotted((*loc, *d.key.split('.')))}: found {d.found}; allowed: {d.allowed}"
+            (
+                ".".join((*loc, d.key)),
+                f"{_dotted((*loc, *d.key.split('.')))}: found {d.found}; allowed: {d.allowed}",
+            )
             for d in raised.disagreements
         ]
+    return [(".".join(loc), _fault_line(details, loc, table))]
+
+
+def _fault_line(details: ErrorDetails, loc: tuple[str, ...], table: Mapping[str, Any]) -> str:
+    raised = details.get("ctx", {}).get("error")
     if details["type"] == "extra_forbidden":
-        return [_unknown_key_line(loc, table)]
+        return _unknown_key_line(loc, table)
     found = f"{_dotted(loc)}: found {shown_value(details['input'])}"
-    schemas = _section_schemas()
     if len(loc) == 1:
-        return [f"{found}; allowed: a table, [{loc[0]}]"]
+        return f"{found}; allowed: a table, [{loc[0]}]"
     if isinstance(raised, ValueError):
-        return [f"{found}; allowed: {raised}"]
-    return [f"{found}; allowed: {allowed_values(schemas[loc[0]]['properties'][loc[1]])}"]
+        return f"{found}; allowed: {raised}"
+    return f"{found}; allowed: {allowed_values(section_schemas()[loc[0]]['properties'][loc[1]])}"
 
 
 def _unknown_key_line(loc: tuple[str, ...], table: Mapping[str, Any]) -> str:
-    schemas = _section_schemas()
+    schemas = section_schemas()
     key = loc[-1]
     if len(loc) > 1:
         known: Sequence[str] = list(schemas[loc[0]]["properties"])

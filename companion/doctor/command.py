@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import sys
+from pathlib import Path
 
 from companion.clock import RealClock
-from companion.config import Config
-from companion.config_file import load_config
+from companion.config_sources import ConfigPlaces, load
 from companion.doctor.checks import judge
 from companion.doctor.listen import examine
 from companion.doctor.report import as_json, as_text, exit_code
@@ -34,7 +35,8 @@ def doctor_parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    config = load_config(arguments.config) if arguments.config else Config()
+    file = Path(arguments.config) if arguments.config else None
+    config = load(ConfigPlaces(file, dict(os.environ))).config
     # What happens meanwhile is in the checklist; only what is broken is worth a line of its own.
     quiet = config.log.model_copy(update={"level": "error"})
     with open_log(quiet) as log:

@@ -5,7 +5,8 @@ import pytest
 from pydantic import ValidationError
 
 from companion.config import Config, DetectorConfig, GuidanceConfig, LinkConfig, SourceConfig
-from companion.config_file import default_toml, load_config, parse_config
+from companion.config_file import default_toml, parse_config
+from companion.config_sources import load_config
 from companion.errors import ConfigError
 
 

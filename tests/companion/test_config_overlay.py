@@ -7,8 +7,8 @@ import tomllib
 
 import pytest
 
-from companion.config_file import load_config
 from companion.config_overlay import write_overlay
+from companion.config_sources import load_config
 from companion.errors import ConfigError
 
 

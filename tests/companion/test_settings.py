@@ -8,7 +8,7 @@ import contextlib
 from structlog.testing import CapturingLogger
 
 from companion.config import Config, GroundStationConfig
-from companion.config_file import load_config
+from companion.config_sources import load_config
 from companion.guidance.engagement import Answer
 from companion.settings import ENGAGE, Settings
 

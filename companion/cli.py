@@ -119,7 +119,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from companion.clock import RealClock
     from companion.config_sources import ConfigPlaces, load
     from companion.event_loop import loop_factory
-    from companion.log import open_log
+    from companion.log import LevelGate, open_log
     from companion.service import Service
     from companion.systemd import ServiceNotifier
 
@@ -128,15 +128,17 @@ def _run(arguments: argparse.Namespace) -> int:
         Path(arguments.config) if arguments.config else None, dict(os.environ), tuple(arguments.option)
     )
     config = load(places).config
+    gate = LevelGate(config.log.level)
 
     async def serve() -> None:
-        service = Service(config, clock=RealClock(), log=log, notifier=notifier)
+        service = Service(config, clock=RealClock(), log=log, notifier=notifier, places=places, gate=gate)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)
+        loop.add_signal_handler(signal.SIGHUP, service.reload)
         await service.run()
 
-    with open_log(config.log) as log:
+    with open_log(config.log, gate=gate) as log:
         try:
             with asyncio.Runner(loop_factory=loop_factory(config.link.event_loop)) as runner:
                 runner.run(serve())

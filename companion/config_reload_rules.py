@@ -47,6 +47,8 @@ _RESTART: Final[Mapping[str, str]] = {
     "engagement": "who may engage does not change in flight",
     "ground_station": "our own component is built at the start",
     "log": "the log is open",
+    "detector.restart_delay_max_s": "the delays begin with the first worker",
+    "detector.restart_delay_s": "the delays begin with the first worker",
     "status": "the sockets are open",
     "reload": "the watch has begun",
 }

@@ -36,6 +36,30 @@ _QUEUE_LINES = 2000
 _FLUSH_S = 1.0
 _RETRY_S = 0.5
 _MAX_DEPTH = 6
+_SEVERITY = {"debug": 10, "info": 20, "warning": 30, "warn": 30, "error": 40, "exception": 40, "critical": 50}
+
+
+class LevelGate:
+    """Lets events through that are at least as severe as a level, which may change while the log is open.
+
+    Parameters
+    ----------
+    level
+        ``debug``, ``info``, ``warning`` or ``error``.
+    """
+
+    def __init__(self, level: str) -> None:
+        self._least = _SEVERITY[level]
+
+    def set_level(self, level: str) -> None:
+        """Take another level."""
+        self._least = _SEVERITY[level]
+
+    def __call__(self, logger: WrappedLogger, method: str, event: EventDict) -> EventDict:  # noqa: ARG002  structlog's signature
+        """Return the event, or drop it."""
+        if _SEVERITY.get(method, _SEVERITY["critical"]) < self._least:
+            raise structlog.DropEvent
+        return event
 
 
 class LineWriter:
@@ -142,7 +166,9 @@ def wants_json(config: LogConfig, stream: TextIO | None) -> bool:
 
 
 @contextlib.contextmanager
-def open_log(config: LogConfig, stream: TextIO | None = None) -> Iterator[Log]:
+def open_log(
+    config: LogConfig, stream: TextIO | None = None, *, gate: LevelGate | None = None
+) -> Iterator[Log]:
     """Yield the service's logger; its lines are written out when the context ends.
 
     Records of other libraries' ``logging`` (asyncio, mavsdk) go the same way meanwhile, as
@@ -154,6 +180,8 @@ def open_log(config: LogConfig, stream: TextIO | None = None) -> Iterator[Log]:
         Level and format.
     stream
         Where lines go; standard error where it is None. One without a file descriptor works too.
+    gate
+        What is logged, where that may change meanwhile; by default ``config.level`` for good.
     """
     stream = sys.stderr if stream is None else stream
     as_json = wants_json(config, stream)
@@ -166,6 +194,7 @@ def open_log(config: LogConfig, stream: TextIO | None = None) -> Iterator[Log]:
 
     writer = LineWriter(_sink_of(stream), dropped_line)
     processors: list[Processor] = [
+        LevelGate(config.level) if gate is None else gate,
         structlog.processors.add_log_level,
         stamp,
         structlog.processors.format_exc_info,
@@ -176,7 +205,9 @@ def open_log(config: LogConfig, stream: TextIO | None = None) -> Iterator[Log]:
         structlog.wrap_logger(
             _Lines(writer),
             processors=processors,
-            wrapper_class=structlog.make_filtering_bound_logger(config.level),
+            wrapper_class=structlog.make_filtering_bound_logger(
+                config.level if gate is None else "debug"  # else the gate alone decides
+            ),
             context_class=dict,
         ).bind(),
     )

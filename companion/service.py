@@ -11,6 +11,7 @@ component      10 Hz      our own component: answers that wait, TIMESYNC, plots,
 takeover       20 Hz      flies where the mission's way is not free (``interception.mode = "takeover"`` only)
 settings       events     writes what a ground station has set to its file
 status         config     one line with all rates and ages
+reload         events     reads the configuration again when asked, or when a file of it has changed
 systemd        1 Hz       feeds its watchdog, only while health has run; where it started us
 =============  =========  ==============================================================================
 
@@ -28,6 +29,7 @@ from typing import Any, Final
 from companion.addressed import AddressedSetpoints
 from companion.clock import Clock
 from companion.config import Config
+from companion.config_sources import ConfigPlaces
 from companion.errors import SourceError
 from companion.frames.camera import CameraSource
 from companion.frames.file import FileSource
@@ -35,7 +37,7 @@ from companion.frames.open import open_source
 from companion.frames.source import FrameSource
 from companion.guidance.observation import DetectionReport
 from companion.interception import Interception
-from companion.log import Log
+from companion.log import LevelGate, Log
 from companion.mavlink.endpoint import Endpoint
 from companion.mavlink.endpoints import make_side
 from companion.mavlink.identity import Identity
@@ -43,6 +45,7 @@ from companion.mavlink.network import Side
 from companion.mavlink.proxy import InlineProxy, OwnComponent
 from companion.mavlink.signing import Signatures, open_signatures
 from companion.own import Own
+from companion.reload import Reload
 from companion.systemd import ServiceNotifier
 from companion.takeover import TakeoverFlight
 from companion.vision.supervisor import VisionSupervisor
@@ -72,6 +75,10 @@ class Service:
         Makes the frame source; by default the one that the configuration names. A simulator gives its own.
     notifier
         Whom to tell that the service works; by default nobody.
+    places
+        Where the configuration is read again from; by default it holds for the whole run.
+    gate
+        What is logged, where a reload may change that.
     """
 
     def __init__(
@@ -82,6 +89,8 @@ class Service:
         log: Log,
         open_frames: Callable[[], FrameSource] | None = None,
         notifier: ServiceNotifier | None = None,
+        places: ConfigPlaces | None = None,
+        gate: LevelGate | None = None,
     ) -> None:
         self._config = config
         self._clock = clock
@@ -89,6 +98,9 @@ class Service:
         self._open_frames = open_frames or partial(open_source, config.source, clock=clock, log=log)
         self._links: tuple[Endpoint, ...] = ()
         self._stop = asyncio.Event()
+        self._places = places
+        self._gate = gate
+        self._reload: Reload | None = None
         self._notifier = notifier if notifier is not None else ServiceNotifier(None)
         self._health_ns = clock.now_ns()
         self._health_has_run = False
@@ -106,6 +118,11 @@ class Service:
     def stop(self) -> None:
         """End the service; :meth:`run` returns soon after."""
         self._stop.set()
+
+    def reload(self) -> None:
+        """Read the configuration again and take what may change in flight; soon after, and announced."""
+        if self._reload is not None:
+            self._reload.request()
 
     async def run(self) -> None:
         """Run until :meth:`stop`.
@@ -167,6 +184,19 @@ class Service:
                 "settings": own.settings.keep(own.complain),
                 "status": self._status(flight, vision, proxy, own),
             }
+            if self._places is not None:
+                self._reload = Reload(
+                    self._places,
+                    config,
+                    settings=own.settings,
+                    vision=vision,
+                    notifier=self._notifier,
+                    say=identity.status_text,
+                    gate=self._gate,
+                    clock=clock,
+                    log=log,
+                )
+                loops["reload"] = self._reload.run()
             if takeover is not None:
                 loops["takeover"] = takeover.run(clock)
             if self._notifier.enabled:

@@ -55,9 +55,35 @@ class Settings:
         self._is_armed = is_armed
         self._log = log
         self._unsaved: dict[str, Value] = {}
+        self._writing: dict[str, Value] = {}
+        self.revision = 0
+        """Counts the changes made by a ground station: whoever reads the files meanwhile reads them again."""
         self._changed = asyncio.Event()
         self._by_name = {setting.name: setting for setting in SETTINGS}
         self._names = tuple(sorted([*self._by_name, ENGAGE]))
+
+    @property
+    def active(self) -> Config:
+        """The configuration that acts."""
+        return self._active
+
+    @property
+    def unsaved(self) -> dict[str, Value]:
+        """Values by dotted key that may not be in the parameters' file yet."""
+        return {**self._writing, **self._unsaved}
+
+    def take(self, active: Config, kept: Config) -> None:
+        """Take a configuration that was read again.
+
+        Parameters
+        ----------
+        active
+            What acts from now on: what may change in flight is new in it.
+        kept
+            What will act after a restart.
+        """
+        self._active, self._kept = active, kept
+        self._apply(active)
 
     def names(self) -> tuple[str, ...]:
         """Return all names in alphabetical order."""
@@ -88,6 +114,7 @@ class Settings:
         if number_of(kept, setting) == number_of(self._kept, setting):
             return None  # nothing new: ground stations repeat themselves
         self._kept = kept
+        self.revision += 1
         self._unsaved[setting.key] = value_of(kept, setting)
         self._changed.set()
         self._log.info("setting_changed", key=setting.key, value=value_of(kept, setting), live=setting.live)
@@ -109,6 +136,7 @@ class Settings:
             await self._changed.wait()
             self._changed.clear()
             changes, self._unsaved = self._unsaved, {}
+            self._writing = changes
             name = self._kept.ground_station.parameters_file
             try:
                 if not name:
@@ -122,3 +150,4 @@ class Settings:
                     failed = str(error)
                     self._log.error("settings_not_kept", error=failed)
                     complain(failed)
+            self._writing = {}

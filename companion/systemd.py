@@ -48,6 +48,7 @@ class ServiceNotifier:
         self._socket: socket.socket | None = None
         self._watchdog_ns = watchdog_ns
         self._status = ""
+        self._is_ready = False
         if address is None:
             return
         if not address.startswith(("/", "@")):
@@ -93,7 +94,8 @@ class ServiceNotifier:
         return min(_STATUS_PERIOD_NS, self._watchdog_ns // _FEEDS_A_PERIOD)
 
     def ready(self) -> None:
-        """Say that the service does its work from now on, after a start or a reload."""
+        """Say that the service does its work from now on."""
+        self._is_ready = True
         self._send("READY=1")
 
     def working(self, status: str) -> None:
@@ -106,14 +108,20 @@ class ServiceNotifier:
             self._status = line
 
     def reloading(self, now_ns: int) -> None:
-        """Say that the configuration is being read again; :meth:`ready` ends that.
+        """Say that the configuration is being read again; :meth:`reloaded` ends that. Before :meth:`ready` it says nothing.
 
         Parameters
         ----------
         now_ns
             CLOCK_MONOTONIC: a unit of ``Type=notify-reload`` tells by it which request is answered.
         """
-        self._send("RELOADING=1", f"MONOTONIC_USEC={now_ns // 1000}")
+        if self._is_ready:
+            self._send("RELOADING=1", f"MONOTONIC_USEC={now_ns // 1000}")
+
+    def reloaded(self) -> None:
+        """Say that the configuration has been read again, to whatever end. Before :meth:`ready` it says nothing."""
+        if self._is_ready:
+            self._send("READY=1")
 
     def stopping(self) -> None:
         """Say that the service is ending on purpose."""

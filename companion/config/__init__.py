@@ -13,8 +13,10 @@ from companion.config.ground_station import GroundStationConfig
 from companion.config.guidance import GuidanceConfig
 from companion.config.link import LinkConfig
 from companion.config.log import LogConfig
+from companion.config.reload import ReloadConfig
 from companion.config.section import Disagreement, DisagreementError, Section
 from companion.config.source import SourceConfig
+from companion.config.status import StatusConfig
 from companion.config.takeover import InterceptionConfig
 
 __all__ = [
@@ -29,7 +31,9 @@ __all__ = [
     "InterceptionConfig",
     "LinkConfig",
     "LogConfig",
+    "ReloadConfig",
     "SourceConfig",
+    "StatusConfig",
 ]
 
 
@@ -45,6 +49,8 @@ class Config(Section):
     engagement: EngagementConfig = EngagementConfig()
     ground_station: GroundStationConfig = GroundStationConfig()
     log: LogConfig = LogConfig()
+    status: StatusConfig = StatusConfig()
+    reload: ReloadConfig = ReloadConfig()
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
         if self.camera.file:  # the field of view is then known only to whoever reads that file

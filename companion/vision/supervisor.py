@@ -91,7 +91,8 @@ class VisionSupervisor:
     on_report
         Called on the event loop with each report, at once.
     log
-        Takes ``worker_starting``, ``worker_ready``, ``worker_died``, ``worker_output`` and ``frame_refused``.
+        Takes ``worker_starting``, ``worker_ready``, ``worker_died``, ``worker_replaced``, ``worker_output`` and
+        ``frame_refused``.
     pipeline
         ``package.module:factory`` of what the worker runs (``companion.vision.pipeline``).
     """
@@ -107,6 +108,8 @@ class VisionSupervisor:
         pipeline: str = VOID_PIPELINE,
     ) -> None:
         self._detector = detector
+        self._camera = camera
+        self._pipeline = pipeline
         self._start_message = Start(pipeline, detector, camera)
         self._clock = clock
         self._on_report = on_report
@@ -174,6 +177,16 @@ class VisionSupervisor:
         )
         self._dispatch()
 
+    def replace(self, detector: DetectorConfig) -> None:
+        """Build the worker from other settings: the present one ends, the next one starts at once.
+
+        There are no reports in between, which is some seconds. Try settings with :meth:`validate` of another supervisor first.
+        """
+        self._detector = detector
+        self._start_message = Start(self._pipeline, detector, self._camera)
+        if self._life is not None:
+            self._life.inbox.put_nowait(_Replaced())
+
     async def validate(self) -> None:
         """Have a worker build its pipeline once, and end it again.
 
@@ -229,6 +242,9 @@ class VisionSupervisor:
                         self._life = self._in_flight = None
                         self._state = "backoff"
                         exit_status = await life.stop(grace_s)
+                    if death.is_wanted:
+                        self._log.info("worker_replaced", reason=death.reason, pid=life.pid)
+                        continue
                     delay_s = backoff.delay_after_s(life.answered_for_s)
                     self._log.error(
                         "worker_died",
@@ -271,6 +287,8 @@ class VisionSupervisor:
                     self._state = "ready"
                     self._last_report_ns = self._clock.now_ns()
                     self._on_report(message.report)
+                case _Replaced():
+                    return _Death("settings changed", is_wanted=True)
                 case Unusable() if not self._was_ready.is_set():
                     raise ConfigError(message.message)  # it never worked, and no restart will mend a file
                 case Failed():
@@ -331,6 +349,7 @@ class _Death:
     reason: str
     details: dict[str, str] = field(default_factory=dict)
     grace_s: float = 0.0
+    is_wanted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,6 +358,11 @@ class _Overrun:
 
     turn: int
     reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Replaced:
+    """Another worker is wanted in its place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,7 +413,7 @@ class _Life:
     """One worker from its start to its end; everything that happens to it arrives in ``inbox``, in order."""
 
     def __init__(self, thread: _WorkerThread, clock: Clock, log: Log, config: DetectorConfig) -> None:
-        self.inbox: asyncio.Queue[FromWorker | _Overrun | _Ended] = asyncio.Queue()
+        self.inbox: asyncio.Queue[FromWorker | _Overrun | _Ended | _Replaced] = asyncio.Queue()
         self.mapped: FrameSlots | None = None
         self.pid: int | None = None
         self._thread = thread
@@ -481,7 +505,7 @@ class _Life:
         if self._first_answer_ns is None:
             self._first_answer_ns = self._last_answer_ns
 
-    def cause_of(self, message: FromWorker | _Overrun | _Ended) -> str:
+    def cause_of(self, message: FromWorker | _Overrun | _Ended | _Replaced) -> str:
         """Return why this message is the end of the worker."""
         match message:
             case _Overrun() | _Ended():
@@ -490,6 +514,8 @@ class _Life:
                 return message.message
             case Failed():
                 return f"{message.error}\n{message.traceback}"
+            case _Replaced():
+                return "settings changed"
             case _:
                 return f"said {message.kind} out of turn"
 

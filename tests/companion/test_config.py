@@ -137,7 +137,7 @@ def test_an_integer_does_for_a_float():
         ("[cammera]\nx = 1", "cammera: unknown table; did you mean camera?"),
         (
             "zzz = 1",
-            "zzz: unknown key; allowed here: source, camera, detector, link, guidance, interception, engagement, ground_station, log",
+            "zzz: unknown key; allowed here: source, camera, detector, link, guidance, interception, engagement, ground_station, log, status, reload",
         ),
         ('[camera]\n"a b" = 70', 'camera."a b": unknown key; allowed here: hfov_deg, file, mount_roll_deg,'),
     ],

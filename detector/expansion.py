@@ -489,7 +489,9 @@ def free_range_along(
     vouched = _vouched(samples.inverse_per_m[near_ray], samples.sigma_per_m[near_ray])
     covered_m = _covered_m(samples, ray, side, vertical, half_width_m, hidden_width_m, vouched.distance_m)
     if covered_m < vouched.distance_m:
-        vouched = MetricRange(covered_m, vouched.spread_m, vouched.samples)
+        # The parallax is as sure as before; nearer it means fewer metres.
+        spread_m = vouched.spread_m * (covered_m / vouched.distance_m) ** 2
+        vouched = MetricRange(covered_m, spread_m, vouched.samples)
 
     along_m, beside_m, above_m = np.stack((ray, side, vertical)) @ samples.points_m.T
     ahead = samples.is_resolved & (along_m > 0.0) & (np.abs(above_m) <= half_height_m)

@@ -113,8 +113,10 @@ class SeedFinder:
 
         Returns
         -------
-        (N, 2) float32 px; None where so many were lost that the frame has to be looked at whole.
+        (N, 2) float32 px; None where so many were lost that the frame has to be looked at whole, or nothing is known of the scene.
         """
+        if self._kept_of_whole == 0:
+            return None
         params = self._params
         carried = _thinned(np.asarray(carried_px, np.float32), params.fast_points)
         tile_of = _tile_of(carried, image)

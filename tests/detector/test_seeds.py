@@ -121,6 +121,12 @@ def test_nothing_found_and_nothing_carried_is_no_error() -> None:
     found, number = seeds.find(blank)
     assert found.shape == (0, 2)
     assert number == 0
-    renewed = seeds.renew(blank, found)
-    assert renewed is not None
-    assert renewed.shape == (0, 2)
+    assert seeds.renew(blank, found) is None, "it is looked at whole again"
+
+
+def test_after_the_scene_was_forgotten_few_carried_ones_do_not_stand_for_the_whole_frame() -> None:
+    image = texture()
+    seeds = finder(fast_points=500, fast_tiles=1)
+    found, _ = seeds.find(image)
+    seeds.reset()
+    assert seeds.renew(image, found[:40]) is None

@@ -445,7 +445,10 @@ async def test_tiny_images_are_reported_not_crashed_on(tmp_path):
     for number in range(5):
         cv2.imwrite(str(folder / f"{number}.png"), np.full((1, 1), 90, np.uint8))
     service = CompanionProcess(
-        {"source": {"url": f"file:{folder}", "loop": True}, "log": {"status_interval_s": 0.5, "detections": True}}
+        {
+            "source": {"url": f"file:{folder}", "loop": True},
+            "log": {"status_interval_s": 0.5, "detections": True},
+        }
     )
     async with service:
         event = await service.wait_for("detection", 60)

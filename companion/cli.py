@@ -70,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("config", help="print a configuration: in force, default, its schema", add_help=False)
     commands.add_parser("sim", help="fly closed loop in a simulated indoor world", add_help=False)
     commands.add_parser("cameras", help="list cameras, take a picture, measure their timing", add_help=False)
+    commands.add_parser("status", help="what the running service says of itself", add_help=False)
     commands.add_parser("doctor", help="say what is missing before a flight, and what to do", add_help=False)
     commands.add_parser("calibrate", help="make or judge a camera file with a board", add_help=False)
     return parser
@@ -99,6 +100,12 @@ def _doctor_parser() -> argparse.ArgumentParser:
     return doctor_parser()
 
 
+def _status_parser() -> argparse.ArgumentParser:
+    from companion.status.command import status_parser
+
+    return status_parser()
+
+
 def _calibrate_parser() -> argparse.ArgumentParser:
     from companion.calibrate.command import calibrate_parser
 
@@ -111,6 +118,7 @@ _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
     "cameras": _cameras_parser,
     "doctor": _doctor_parser,
     "calibrate": _calibrate_parser,
+    "status": _status_parser,
 }
 """Commands whose modules import much that nothing else needs."""
 
@@ -121,6 +129,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from companion.event_loop import loop_factory
     from companion.log import LevelGate, open_log
     from companion.service import Service
+    from companion.status.unix_socket import runtime_folder
     from companion.systemd import ServiceNotifier
 
     notifier = ServiceNotifier.from_environment()  # before anything is started that could inherit it
@@ -131,7 +140,15 @@ def _run(arguments: argparse.Namespace) -> int:
     gate = LevelGate(config.log.level)
 
     async def serve() -> None:
-        service = Service(config, clock=RealClock(), log=log, notifier=notifier, places=places, gate=gate)
+        service = Service(
+            config,
+            clock=RealClock(),
+            log=log,
+            notifier=notifier,
+            places=places,
+            gate=gate,
+            runtime_folder=runtime_folder(os.environ),
+        )
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, service.stop)

@@ -28,7 +28,7 @@ from companion.errors import ConfigError
 
 ENVIRONMENT_PREFIX: Final = "VOID_COMPANION_"
 DEFAULT_NAME: Final = "default"
-_PATH_KEYS: Final = ("camera.file", "detector.params_file", "link.signing_key_file")
+_PATH_KEYS: Final = ("camera.file", "detector.params_file", "link.signing_key_file", "status.socket")
 _FILE_SCHEME: Final = "file:"
 _MARKS_OF_TOML: Final = ("[", '"', "'")
 

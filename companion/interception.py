@@ -296,6 +296,11 @@ class Interception:
         if pose is not None and speed_m_s is not None:
             self.switch.on_pose(pose, speed_m_s)
 
+    def autopilot_age_ms(self, now_ns: int) -> int | None:
+        """Return the age of the autopilot's newest HEARTBEAT; None before the first."""
+        seen = self._autopilot_heartbeat_ns
+        return None if seen is None else round((now_ns - seen) / 1e6)
+
     # ------------------------------------------------------------------ from our own component
 
     @property

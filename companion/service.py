@@ -11,6 +11,8 @@ component      10 Hz      our own component: answers that wait, TIMESYNC, plots,
 takeover       20 Hz      flies where the mission's way is not free (``interception.mode = "takeover"`` only)
 settings       events     writes what a ground station has set to its file
 status         config     one line with all rates and ages
+status-socket  events     answers ``companion status`` and commands, where there is a place for its socket
+metrics        events     answers Prometheus, where that is switched on
 reload         events     reads the configuration again when asked, or when a file of it has changed
 systemd        1 Hz       feeds its watchdog, only while health has run; where it started us
 =============  =========  ==============================================================================
@@ -24,6 +26,7 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 from companion.addressed import AddressedSetpoints
@@ -46,6 +49,10 @@ from companion.mavlink.proxy import InlineProxy, OwnComponent
 from companion.mavlink.signing import Signatures, open_signatures
 from companion.own import Own
 from companion.reload import Reload
+from companion.status.machine import Machine
+from companion.status.server import Command, StatusServer
+from companion.status.snapshot import Section, Snapshots
+from companion.status.unix_socket import socket_path
 from companion.systemd import ServiceNotifier
 from companion.takeover import TakeoverFlight
 from companion.vision.supervisor import VisionSupervisor
@@ -79,6 +86,15 @@ class Service:
         Where the configuration is read again from; by default it holds for the whole run.
     gate
         What is logged, where a reload may change that.
+    runtime_folder
+        Where the status socket is made when the configuration names no place for it; None: nowhere.
+
+    Attributes
+    ----------
+    commands
+        What may be asked for at the status socket besides the status, by name.
+    sections
+        Further parts of the status, by name.
     """
 
     def __init__(
@@ -91,7 +107,11 @@ class Service:
         notifier: ServiceNotifier | None = None,
         places: ConfigPlaces | None = None,
         gate: LevelGate | None = None,
+        runtime_folder: Path | None = None,
     ) -> None:
+        self.commands: dict[str, Command] = {}
+        self.sections: dict[str, Section] = {}
+        self._runtime_folder = runtime_folder
         self._config = config
         self._clock = clock
         self._log = log
@@ -197,6 +217,7 @@ class Service:
                     log=log,
                 )
                 loops["reload"] = self._reload.run()
+            loops.update(self._status_loops(flight, own, proxy, vision))
             if takeover is not None:
                 loops["takeover"] = takeover.run(clock)
             if self._notifier.enabled:
@@ -218,6 +239,36 @@ class Service:
             finally:
                 log.info("summary", **flight.statistics.summary(), **proxy.counters.as_dict())
                 log.info("service_stopped")
+
+    def _status_loops(
+        self, flight: Interception, own: Own, proxy: InlineProxy, vision: VisionSupervisor
+    ) -> dict[str, Coroutine[Any, Any, None]]:
+        """Return the loops that tell other programs on this computer how the service is."""
+        config, clock, log = self._config, self._clock, self._log
+        path = socket_path(config.status, self._runtime_folder)
+        loops: dict[str, Coroutine[Any, Any, None]] = {}
+        if path is None:
+            return loops
+        kept = config.ground_station.parameters_file
+        snapshots = Snapshots(
+            flight=flight,
+            own=own,
+            proxy=proxy,
+            vision=vision,
+            links=self._links,
+            source=lambda: (
+                self._config.source.shown_url,
+                self._with_reason(self._source_fault),
+                self._last_frame_ns,
+            ),
+            machine=Machine(Path(kept).parent if kept else Path(), clock=clock),
+            sections=self.sections,
+            clock=clock,
+            log=log,
+        )
+        server = StatusServer(path, snapshot=snapshots.take, commands=self.commands, log=log)
+        loops["status-socket"] = server.run()
+        return loops
 
     def _apply(self, config: Config) -> None:
         """Take settings that were changed in flight."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from companion.mavlink.component import TIMESYNC, TIMESYNC_FIELDS
 from companion.mavlink.framing import Framer, FramingCounters, RawFrame
 
 _SETPOINT = 84
@@ -49,7 +50,8 @@ def compare(
 ) -> Comparison:
     """Compare what left each end with what reached the other; frames as bytes, in order.
 
-    Frames of other senders (the companion's own HEARTBEAT and STATUSTEXT) are left out of what was received.
+    Frames of other senders (the companion's own HEARTBEAT and STATUSTEXT) are left out of what was received, and
+    answers to a TIMESYNC that the other end never asked out of what was sent: they are for the companion.
 
     Parameters
     ----------
@@ -65,8 +67,9 @@ def compare(
     sent = [frame for frame in up_sent if frame.message_id == _SETPOINT]
     received = [frame for frame in up_received if frame.message_id == _SETPOINT]
     lost, z_changed = _match_setpoints(sent, received)
-    up = _match_others(up_sent, up_received, unjudged)
-    down = _match_others(_frames(autopilot_sent), _frames(planner_received), unjudged)
+    down_sent = _frames(autopilot_sent)
+    up = _match_others(_for_the_other_end(up_sent, down_sent), up_received, unjudged)
+    down = _match_others(_for_the_other_end(down_sent, up_sent), _frames(planner_received), unjudged)
     return Comparison(
         setpoints_sent=len(sent),
         setpoints_received=len(received),
@@ -89,6 +92,21 @@ def _seq(frame: RawFrame) -> int:
 
 def _z(frame: RawFrame) -> bytes:
     return frame.payload.ljust(53, b"\0")[_Z]
+
+
+def _for_the_other_end(sent: Sequence[RawFrame], other_sent: Sequence[RawFrame]) -> list[RawFrame]:
+    asked = {ts1 for frame in other_sent if (times := _timesync(frame)) for tc1, ts1 in [times] if tc1 == 0}
+    return [frame for frame in sent if not (times := _timesync(frame)) or times[0] == 0 or times[1] in asked]
+
+
+def _timesync(frame: RawFrame) -> tuple[int, int] | None:
+    """Return tc1 and ts1 of a TIMESYNC; tc1 is 0 in a question, ts1 is the asker's time in both."""
+    if frame.message_id != TIMESYNC:
+        return None
+    tc1, ts1 = TIMESYNC_FIELDS.unpack(
+        frame.payload.ljust(TIMESYNC_FIELDS.size, b"\0")[: TIMESYNC_FIELDS.size]
+    )
+    return tc1, ts1
 
 
 def _match_setpoints(sent: Sequence[RawFrame], received: Sequence[RawFrame]) -> tuple[int, int]:

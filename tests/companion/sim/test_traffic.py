@@ -65,3 +65,14 @@ def test_frames_of_third_parties_and_frames_not_judged_are_left_out():
     own = talk(2, system=1)
     result = compare(frames[:3], [*frames, *own], [], [], not_judged=frames[3:])
     assert (result.other_lost, result.other_altered) == (0, 0)
+
+
+def timesync(system: int, tc1: int, ts1: int) -> bytes:
+    return bytes(mavlink.MAVLink_timesync_message(tc1, ts1).pack(mavlink.MAVLink(None, system, 1)))
+
+
+def test_answers_to_what_the_companion_asked_are_not_lost_and_those_to_the_planner_are():
+    question, answer, for_companion = timesync(245, 0, 11), timesync(1, 900, 11), timesync(1, 901, 12)
+    result = compare([question], [question], [answer, for_companion], [answer])
+    assert (result.other_sent, result.other_lost, result.other_altered) == (2, 0, 0)
+    assert compare([question], [question], [answer, for_companion], []).other_lost == 1

@@ -49,6 +49,7 @@ from companion.mavlink.proxy import InlineProxy, OwnComponent
 from companion.mavlink.signing import Signatures, open_signatures
 from companion.own import Own
 from companion.reload import Reload
+from companion.status.http import MetricsServer
 from companion.status.machine import Machine
 from companion.status.server import Command, StatusServer
 from companion.status.snapshot import Section, Snapshots
@@ -245,9 +246,9 @@ class Service:
     ) -> dict[str, Coroutine[Any, Any, None]]:
         """Return the loops that tell other programs on this computer how the service is."""
         config, clock, log = self._config, self._clock, self._log
-        path = socket_path(config.status, self._runtime_folder)
+        path, port = socket_path(config.status, self._runtime_folder), config.status.metrics_port
         loops: dict[str, Coroutine[Any, Any, None]] = {}
-        if path is None:
+        if path is None and not port:
             return loops
         kept = config.ground_station.parameters_file
         snapshots = Snapshots(
@@ -266,8 +267,12 @@ class Service:
             clock=clock,
             log=log,
         )
-        server = StatusServer(path, snapshot=snapshots.take, commands=self.commands, log=log)
-        loops["status-socket"] = server.run()
+        if path is not None:
+            server = StatusServer(path, snapshot=snapshots.take, commands=self.commands, log=log)
+            loops["status-socket"] = server.run()
+        if port:
+            metrics = MetricsServer(config.status.metrics_host, port, snapshot=snapshots.take, log=log)
+            loops["metrics"] = metrics.run()
         return loops
 
     def _apply(self, config: Config) -> None:

@@ -237,10 +237,12 @@ def test_every_key_has_its_rule_and_what_a_ground_station_may_change_in_flight_a
 
 
 def test_changes_are_only_what_differs_and_what_acts_keeps_the_rest():
-    active = parse_config("[camera]\nhfov_deg = 80.0\n[guidance]\nmax_step_m = 2.0")
+    active = parse_config(
+        '[camera]\nhfov_deg = 80.0\n[guidance]\nmax_step_m = 2.0\n[detector]\nmethod = "paper"'
+    )
     assert not changes_between(active, active).any
     new = parse_config(
-        '[camera]\nhfov_deg = 90.0\n[guidance]\nmax_step_m = 1.0\n[detector]\npreset = "paper"'
+        '[camera]\nhfov_deg = 90.0\n[guidance]\nmax_step_m = 1.0\n[detector]\nmethod = "paper"\npreset = "paper"'
     )
     changes = changes_between(active, new)
     assert dict(changes.at_once) == {"guidance.max_step_m": 1.0}

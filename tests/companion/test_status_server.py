@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import select
 import socket
 import stat
 import threading
@@ -190,9 +191,10 @@ async def test_a_client_that_never_reads_is_hung_up_on_and_others_are_served(tmp
             stalled.settimeout(DEADLINE_S)
             stalled.sendall(pack_request(Request("status")) * 20)
             assert len((await bench.ask())["text"]) == 200_000  # while the other one still stalls
-            await asyncio.sleep(0.5)
-            found = await asyncio.to_thread(_read_to_the_end, stalled)
-            assert found < 20 * 200_000
+            poll = select.poll()
+            poll.register(stalled, select.POLLHUP)
+            assert await asyncio.to_thread(poll.poll, 1000 * DEADLINE_S), "it was not hung up on"
+            assert await asyncio.to_thread(_read_to_the_end, stalled) < 20 * 200_000
 
 
 def _read_to_the_end(sock: socket.socket) -> int:
@@ -277,9 +279,12 @@ def test_a_client_is_told_what_is_wrong(tmp_path):
     with pytest.raises(NotRunningError, match="not running: there is no socket"):
         ask(tmp_path / "none.sock", "status")
     silent = tmp_path / "silent.sock"
-    with open_listener(silent), StatusClient(silent, timeout_s=0.05) as client:
-        with pytest.raises(NoAnswerError, match=r"no answer within 0.05 s: .* hangs"):
-            client.ask("status")
+    with (
+        open_listener(silent),
+        StatusClient(silent, timeout_s=0.05) as client,
+        pytest.raises(NoAnswerError, match=r"no answer within 0.05 s: .* hangs"),
+    ):
+        client.ask("status")
     leaving = tmp_path / "leaving.sock"
     with open_listener(leaving) as listener:
         listener.settimeout(DEADLINE_S)

@@ -13,6 +13,7 @@ from companion.config.ground_station import GroundStationConfig
 from companion.config.guidance import GuidanceConfig
 from companion.config.link import LinkConfig
 from companion.config.log import LogConfig
+from companion.config.recorder import RecorderConfig
 from companion.config.reload import ReloadConfig
 from companion.config.section import Disagreement, DisagreementError, Section
 from companion.config.source import SourceConfig
@@ -31,6 +32,7 @@ __all__ = [
     "InterceptionConfig",
     "LinkConfig",
     "LogConfig",
+    "RecorderConfig",
     "ReloadConfig",
     "SourceConfig",
     "StatusConfig",
@@ -51,6 +53,7 @@ class Config(Section):
     log: LogConfig = LogConfig()
     status: StatusConfig = StatusConfig()
     reload: ReloadConfig = ReloadConfig()
+    recorder: RecorderConfig = RecorderConfig()
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
         if self.camera.file:  # the field of view is then known only to whoever reads that file

@@ -51,6 +51,7 @@ _RESTART: Final[Mapping[str, str]] = {
     "detector.restart_delay_s": "the delays begin with the first worker",
     "status": "the sockets are open",
     "reload": "the watch has begun",
+    "web": "the page is being served",
     "recorder": "the recorder is built at the start",
 }
 _OTHER_REASON: Final = "it is read at the start"

@@ -28,7 +28,15 @@ from companion.errors import ConfigError
 
 ENVIRONMENT_PREFIX: Final = "VOID_COMPANION_"
 DEFAULT_NAME: Final = "default"
-_PATH_KEYS: Final = ("camera.file", "detector.params_file", "link.signing_key_file", "status.socket")
+_PATH_KEYS: Final = (
+    "camera.file",
+    "detector.params_file",
+    "link.signing_key_file",
+    "status.socket",
+    "web.recordings",
+    "web.settings_file",
+    "web.token_file",
+)
 _FILE_SCHEME: Final = "file:"
 _MARKS_OF_TOML: Final = ("[", '"', "'")
 
@@ -170,7 +178,11 @@ def load(places: ConfigPlaces, *, unsaved: Mapping[str, Any] | None = None) -> L
         return layers[0].name if layers else "configuration"
 
     config = config_of(table, name=place_of)
-    return LoadedConfig(_resolved(config, layers, tuned), layers)
+    resolved = _resolved(config, layers, tuned)
+    if resolved.web.enabled and places.file is not None and not resolved.web.settings_file:
+        web = resolved.web.model_copy(update={"settings_file": str(places.file.absolute())})
+        resolved = resolved.model_copy(update={"web": web})
+    return LoadedConfig(resolved, layers)
 
 
 def shown_with_origins(loaded: LoadedConfig) -> str:

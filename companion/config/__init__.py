@@ -19,6 +19,7 @@ from companion.config.section import Disagreement, DisagreementError, Section
 from companion.config.source import SourceConfig
 from companion.config.status import StatusConfig
 from companion.config.takeover import InterceptionConfig
+from companion.config.web import WebConfig
 
 __all__ = [
     "CameraConfig",
@@ -36,6 +37,7 @@ __all__ = [
     "ReloadConfig",
     "SourceConfig",
     "StatusConfig",
+    "WebConfig",
 ]
 
 
@@ -54,6 +56,7 @@ class Config(Section):
     status: StatusConfig = StatusConfig()
     reload: ReloadConfig = ReloadConfig()
     recorder: RecorderConfig = RecorderConfig()
+    web: WebConfig = WebConfig()
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
         if self.camera.file:  # the field of view is then known only to whoever reads that file

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from companion.config.section import Disagreement, Section
 
@@ -15,9 +15,9 @@ class DetectorConfig(Section):
     method: Annotated[
         Literal["paper", "parallax"],
         Field(
-            description="paper: the published method (clusters of flow, lines). parallax: the void map: ranges from dense flow, swept by the vehicle's size, remembered, with a confidence."
+            description="paper: the published method (clusters of flow, lines). parallax: the void map: ranges from dense flow, swept by the vehicle's size, remembered, with a confidence. Where it is not set but preset or params_file is: paper."
         ),
-    ] = "paper"
+    ] = "parallax"
     preset: Annotated[
         Literal["default", "paper"],
         Field(description="Parameter set of the method paper: default (measured best) or paper (literal)."),
@@ -78,6 +78,18 @@ class DetectorConfig(Section):
             ge=1, le=64, description="OpenCV and BLAS threads of the worker. Leave one core to the service."
         ),
     ] = 1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_paper_for_its_settings(cls, table: Any) -> Any:
+        """Take the method paper where only its settings are named: they must not be without effect."""
+        if (
+            isinstance(table, dict)
+            and "method" not in table
+            and ("preset" in table or table.get("params_file"))
+        ):
+            return {**table, "method": "paper"}
+        return table
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
         if self.method == "parallax" and self.params_file:

@@ -82,7 +82,7 @@ class FlightSpec:
     world: str = "room"
     difficulty: str = "medium"
     seed: int = 0
-    method: Method = "paper"
+    method: Method = "parallax"
     planner: PlannerKind = "waypoints"
     realtime: bool = False
     width_px: int = 320

@@ -59,9 +59,9 @@ def add_suite_parser(commands: argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument(
         "--methods",
         type=_methods,
-        default=("paper",),
+        default=("parallax",),
         metavar="M,M",
-        help=f"of {', '.join(get_args(Method))} (default: paper)",
+        help=f"of {', '.join(get_args(Method))} (default: parallax)",
     )
     add_flight_arguments(parser)
     parser.add_argument(

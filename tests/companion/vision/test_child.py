@@ -49,7 +49,7 @@ def flight_north(scene: Scene, steps: int, *, heading_deg: float = 0.0) -> list[
 def reports_on(
     flown: list[tuple[Frame, Pose]], camera: CameraConfig, *, with_pose: bool = True
 ) -> list[DetectionReport]:
-    pipeline = build_pipeline(DetectorConfig(), camera)
+    pipeline = build_pipeline(DetectorConfig(method="paper"), camera)
     return [pipeline.detect(frame, pose if with_pose else None) for frame, pose in flown]
 
 
@@ -200,7 +200,7 @@ def write_camera_file(path: Path) -> Path:
 @pytest.mark.parametrize("shape", [(1, 1), (300, 300), (480, 320)])
 def test_frames_that_are_not_the_calibrated_cameras_are_no_detection(tmp_path: Path, shape):
     pipeline = build_pipeline(
-        DetectorConfig(), CameraConfig(file=str(write_camera_file(tmp_path / "camera.toml")))
+        DetectorConfig(method="paper"), CameraConfig(file=str(write_camera_file(tmp_path / "camera.toml")))
     )
     report = pipeline.detect(Frame(np.zeros(shape, np.uint8), 5, 3), None)
     assert (report.kind, report.reason) == ("none", "wrong_size")
@@ -211,11 +211,11 @@ def test_a_resized_image_of_the_calibrated_camera_is_used(tmp_path: Path, wall_f
     config = CameraConfig(file=str(write_camera_file(tmp_path / "camera.toml")))
     assert [r.reason for r in reports_on(wall_flight[:1], config)] == ["no_earlier_frame"]
     half = Frame(np.ascontiguousarray(wall_flight[0][0].image[::2, ::2]), 1, 0)
-    assert build_pipeline(DetectorConfig(), config).detect(half, None).reason == "no_earlier_frame"
+    assert build_pipeline(DetectorConfig(method="paper"), config).detect(half, None).reason == "no_earlier_frame"
 
 
 def test_a_frame_of_another_size_starts_anew(wall_flight):
-    pipeline = build_pipeline(DetectorConfig(), CameraConfig(hfov_deg=HFOV_DEG))
+    pipeline = build_pipeline(DetectorConfig(method="paper"), CameraConfig(hfov_deg=HFOV_DEG))
     (first, first_pose), (second, second_pose) = wall_flight[:2]
     pipeline.detect(first, first_pose)
     smaller = Frame(np.ascontiguousarray(second.image[::2, ::2]), second.time_ns, second.seq)
@@ -252,7 +252,7 @@ async def test_the_real_worker_reports_the_wall(wall_flight, wall_reports):
     reports: asyncio.Queue[DetectionReport] = asyncio.Queue()
     with open_log(LogConfig(), io.StringIO()) as log:
         supervisor = VisionSupervisor(
-            DetectorConfig(deadline_s=60.0),
+            DetectorConfig(method="paper", deadline_s=60.0),
             CameraConfig(hfov_deg=HFOV_DEG),
             clock=RealClock(),
             on_report=reports.put_nowait,

@@ -69,6 +69,8 @@ def report_fields(report: DetectionReport, now_ns: int) -> dict[str, Any]:
         "distance_m": report.distance_m,
         "confidence": report.confidence,
         "time_to_contact_frames": report.time_to_contact_frames,
+        "time_to_contact_s": report.time_to_contact_s,
+        "time_to_contact_spread_s": report.time_to_contact_spread_s,
     }
     for name, value in optional.items():
         if value is not None:

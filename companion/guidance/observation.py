@@ -70,6 +70,10 @@ class DetectionReport:
         The pose the detector was given for this frame, if any.
     baseline_m
         Metres flown between the two frames of the pair, where poses are known.
+    time_to_contact_frames
+        Steps of the pair's length until contact with what was seen there; None when not known.
+    time_to_contact_s, time_to_contact_spread_s
+        The same in seconds, at the pair's own mean speed, and its standard deviation.
     distance_m, distance_spread_m
         Metric time to contact along the direction, or to the plane; None when not known.
     bearings
@@ -97,6 +101,8 @@ class DetectionReport:
     pose: Pose | None = None
     baseline_m: float | None = None
     time_to_contact_frames: float | None = None
+    time_to_contact_s: float | None = None
+    time_to_contact_spread_s: float | None = None
     distance_m: float | None = None
     distance_spread_m: float | None = None
     bearings: tuple[BearingRange, ...] = ()

@@ -200,6 +200,7 @@ class VoidPipeline:
                     distance_m, spread_m = _free_range_m(observation, _level_axis(r_ned_from_camera))
             case NoDetection(no_reason, detail):
                 reason = no_reason.value
+        contact_s, contact_spread_s = contact_seconds(contact, observation)
         return DetectionReport(
             frame.seq,
             frame.time_ns,
@@ -213,6 +214,8 @@ class VoidPipeline:
             earlier_frame_ns=observation.earlier_time_ns,
             baseline_m=_finite_or_none(observation.baseline_m),
             time_to_contact_frames=None if contact is None else _finite_or_none(contact.frames),
+            time_to_contact_s=contact_s,
+            time_to_contact_spread_s=contact_spread_s,
             distance_m=distance_m,
             distance_spread_m=spread_m,
             bearings=() if r_ned_from_camera is None else _bearings(observation, model, r_ned_from_camera),
@@ -226,6 +229,24 @@ class VoidPipeline:
             ),
             detector_s=time.perf_counter() - began_s,
         )
+
+
+def contact_seconds(
+    contact: TimeToContact | None, observation: Observation
+) -> tuple[float | None, float | None]:
+    """Return a time to contact in seconds, at the mean speed between the two frames of its pair, and its standard deviation.
+
+    Parameters
+    ----------
+    contact
+        In steps of the pair's length; None where it is not known.
+    observation
+        For the times of the pair's frames.
+    """
+    if contact is None or observation.earlier_time_ns is None:
+        return None, None
+    step_s = (observation.time_ns - observation.earlier_time_ns) / 1e9
+    return _finite_or_none(contact.frames * step_s), _finite_or_none(contact.spread_frames * step_s)
 
 
 def level_rays(model: CameraModel, r_ned_from_camera: Vector) -> list[tuple[float, Vector]]:

@@ -30,8 +30,11 @@ JSON keys
               why there is none; else null
   time_to_contact_frames, time_to_contact_spread_frames, time_to_contact_samples
               in steps of the pair's length, counted from the later frame; null where it is not known
+  time_to_contact_s, time_to_contact_spread_s
+              the same in seconds at the pair's own mean speed, with --interval; else null
   distance_m, distance_spread_m
               the same in metres, with --baseline; else null
+  confidence  in [0, 1], how often answers like it are right; null from a method that does not say
   diagnostics what every step found
 
 exit code
@@ -57,6 +60,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--baseline", type=inputs.metres, metavar="M", help="metres flown between the two frames"
     )
+    parser.add_argument("--interval", type=inputs.seconds, metavar="S", help="seconds between the two frames")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write the annotated later frame")
     parser.set_defaults(run=_run)
@@ -72,12 +76,14 @@ def _run(options: argparse.Namespace) -> int:
     result = VoidDetector(params).detect(earlier, later, camera=camera, later_from_earlier=rotation)
     if options.plot is not None:
         _plot(options.plot, later, result)
-    answer = as_dict(result, options.baseline)
+    answer = as_dict(result, options.baseline, options.interval)
     print(json.dumps(answer, allow_nan=False) if options.json else _text(result, answer))
     return 0
 
 
-def as_dict(result: PairResult, baseline_m: float | None = None) -> dict[str, Any]:
+def as_dict(
+    result: PairResult, baseline_m: float | None = None, interval_s: float | None = None
+) -> dict[str, Any]:
     """Return an answer as plain values that JSON can hold: the keys of ``--json``, see ``detector detect --help``.
 
     Parameters
@@ -86,6 +92,8 @@ def as_dict(result: PairResult, baseline_m: float | None = None) -> dict[str, An
         Answer of the pipeline.
     baseline_m
         Metres flown between the two frames.
+    interval_s
+        Seconds between them.
     """
     detection = result.detection
     direction = detection if isinstance(detection, Direction) else None
@@ -94,6 +102,9 @@ def as_dict(result: PairResult, baseline_m: float | None = None) -> dict[str, An
     distance_m = spread_m = None
     if contact is not None and baseline_m is not None:
         distance_m, spread_m = contact.frames * baseline_m, contact.spread_frames * baseline_m
+    contact_s = contact_spread_s = None
+    if contact is not None and interval_s is not None:
+        contact_s, contact_spread_s = contact.frames * interval_s, contact.spread_frames * interval_s
     answer = {
         "kind": kind_of(detection),
         "x_px": None if direction is None else direction.x_px,
@@ -103,8 +114,11 @@ def as_dict(result: PairResult, baseline_m: float | None = None) -> dict[str, An
         "time_to_contact_frames": None if contact is None else contact.frames,
         "time_to_contact_spread_frames": None if contact is None else contact.spread_frames,
         "time_to_contact_samples": None if contact is None else contact.samples,
+        "time_to_contact_s": contact_s,
+        "time_to_contact_spread_s": contact_spread_s,
         "distance_m": distance_m,
         "distance_spread_m": spread_m,
+        "confidence": None if isinstance(detection, NoDetection) else detection.confidence,
         "diagnostics": dataclasses.asdict(detection.diagnostics),
     }
     cleaned: dict[str, Any] = inputs.json_clean(answer)
@@ -131,6 +145,10 @@ def _text(result: PairResult, answer: dict[str, Any]) -> str:
         rows.append(("why", answer["detail"]))
     if answer["distance_m"] is not None:
         rows.append(("distance", f"{answer['distance_m']:.2f} +- {answer['distance_spread_m']:.2f} m"))
+    if answer["time_to_contact_s"] is not None:
+        rows.append(
+            ("contact", f"{answer['time_to_contact_s']:.2f} +- {answer['time_to_contact_spread_s']:.2f} s")
+        )
     if seen.n_features_earlier:
         rows.append(("key points", f"{seen.n_features_earlier} earlier, {seen.n_features_later} later"))
     if seen.n_tracks:

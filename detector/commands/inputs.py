@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from detector.params import DetectorParams
 
 _MAX_BASELINE_M: Final = 1000.0
+_MAX_INTERVAL_S: Final = 3600.0
 _ROTATION_TOLERANCE: Final = 1e-3
 """Files hold rounded figures: R transpose(R) may differ from the identity by this much."""
 _LARGE: Final = 1e6
@@ -215,6 +216,19 @@ def metres(text: str) -> float:
     if not 0.0 < value <= _MAX_BASELINE_M:
         raise argparse.ArgumentTypeError(
             f"found {text!r}, allowed are metres above 0 and up to {_MAX_BASELINE_M:g}"
+        )
+    return value
+
+
+def seconds(text: str) -> float:
+    """Read seconds from a command line, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value <= _MAX_INTERVAL_S:
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, allowed are seconds above 0 and up to {_MAX_INTERVAL_S:g}"
         )
     return value
 

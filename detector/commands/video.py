@@ -212,13 +212,14 @@ def _record(number: int, frame: ClipFrame, answered: Answered) -> dict[str, Any]
 
     observation = answered.observation
     earlier_ns = observation.earlier_time_ns
+    interval_s = None if earlier_ns is None else (observation.time_ns - earlier_ns) * 1e-9
     return {
         "frame": number,
         "file": frame.name,
         "time_s": frame.time_s,
         "earlier_time_s": None if earlier_ns is None else earlier_ns * 1e-9,
         "baseline_m": observation.baseline_m,
-        **as_dict(answered.result, observation.baseline_m),
+        **as_dict(answered.result, observation.baseline_m, interval_s),
     }
 
 

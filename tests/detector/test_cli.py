@@ -18,7 +18,8 @@ OFFICE = [str(PAIRS / "office" / name) for name in ("00068.jpg", "00069.jpg")]
 BRICKS = [str(PAIRS / "brickwall" / name) for name in ("001.jpg", "003.jpg")]
 KEYS = {
     "kind", "x_px", "y_px", "reason", "detail", "time_to_contact_frames", "time_to_contact_spread_frames",
-    "time_to_contact_samples", "distance_m", "distance_spread_m", "diagnostics",
+    "time_to_contact_samples", "time_to_contact_s", "time_to_contact_spread_s", "distance_m", "distance_spread_m",
+    "confidence", "diagnostics",
 }  # fmt: skip
 
 
@@ -60,8 +61,10 @@ def rotation(tmp_path):
 
 
 def test_a_wall_is_a_single_plane_with_its_time_and_metres(capsys):
-    found = answer(capsys, *BRICKS, "--baseline", "0.25")
+    found = answer(capsys, *BRICKS, "--baseline", "0.25", "--interval", "0.2")
     assert set(found) == KEYS
+    assert found["time_to_contact_s"] == pytest.approx(0.2 * found["time_to_contact_frames"])
+    assert found["time_to_contact_spread_s"] == pytest.approx(0.2 * found["time_to_contact_spread_frames"])
     assert (found["kind"], found["x_px"], found["reason"]) == ("single_plane", None, None)
     assert found["distance_m"] == pytest.approx(0.25 * found["time_to_contact_frames"])
     assert found["time_to_contact_samples"] > 20

@@ -58,6 +58,13 @@ def test_a_wall_ahead_is_a_single_plane_with_its_distance(wall_reports: list[Det
     for report in planes:
         assert report.pose is not None
         assert report.distance_m == pytest.approx(2.7 - report.pose.north_m, rel=0.15)
+        if report.time_to_contact_frames is None:
+            continue
+        # Frames are 0.2 s and steps 0.2 m apart: a metre a second.
+        assert report.time_to_contact_s == pytest.approx(2.7 - report.pose.north_m, rel=0.2)
+        assert report.time_to_contact_spread_s is not None
+        assert 0.0 < report.time_to_contact_spread_s < 1.0
+    assert any(report.time_to_contact_s is not None for report in planes)
 
 
 def test_bearings_measure_what_is_there(wall_reports: list[DetectionReport]) -> None:
@@ -72,7 +79,9 @@ def test_bearings_measure_what_is_there(wall_reports: list[DetectionReport]) -> 
     ]
     assert len(shares) >= 10
     assert max(shares) < 1.15
-    assert np.median(shares) > 0.8
+    assert (
+        np.median(shares) > 0.75
+    )  # about the focus of expansion noise reads near; the surest, at the edges, are not looked through to 2 m
     assert report.obstacles, "the wall is near"
     for north_m, _ in report.obstacles:
         assert north_m == pytest.approx(2.7, abs=0.5)

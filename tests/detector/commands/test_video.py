@@ -16,8 +16,8 @@ from detector.cli import main
 OFFICE = Path(__file__).parents[2] / "data" / "pairs" / "office"
 KEYS = {
     "frame", "file", "time_s", "earlier_time_s", "baseline_m", "kind", "x_px", "y_px", "reason", "detail",
-    "time_to_contact_frames", "time_to_contact_spread_frames", "time_to_contact_samples", "distance_m",
-    "distance_spread_m", "diagnostics",
+    "time_to_contact_frames", "time_to_contact_spread_frames", "time_to_contact_samples", "time_to_contact_s",
+    "time_to_contact_spread_s", "distance_m", "distance_spread_m", "confidence", "diagnostics",
 }  # fmt: skip
 
 

@@ -127,6 +127,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from companion.clock import RealClock
     from companion.config_sources import ConfigPlaces, load
     from companion.event_loop import loop_factory
+    from companion.io.taps import LogTap
     from companion.log import LevelGate, open_log
     from companion.service import Service
     from companion.status.unix_socket import runtime_folder
@@ -148,6 +149,7 @@ def _run(arguments: argparse.Namespace) -> int:
             places=places,
             gate=gate,
             runtime_folder=runtime_folder(os.environ),
+            log_tap=tap,
         )
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -155,7 +157,8 @@ def _run(arguments: argparse.Namespace) -> int:
         loop.add_signal_handler(signal.SIGHUP, service.reload)
         await service.run()
 
-    with open_log(config.log, gate=gate) as log:
+    tap = LogTap()
+    with open_log(config.log, gate=gate, tap=tap) as log:
         try:
             with asyncio.Runner(loop_factory=loop_factory(config.link.event_loop)) as runner:
                 runner.run(serve())

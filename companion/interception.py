@@ -21,6 +21,8 @@ from companion.guidance.setpoint import (
 )
 from companion.guidance.substitution import GaveUp, State, StateChanged, Switch
 from companion.guidance.wish import express, wish_of
+from companion.io.feed import Feed
+from companion.io.messages import Kind
 from companion.log import Log
 from companion.log_fields import report_fields, verdict_fields
 from companion.mavlink.identity import Identity, MavSeverity, MavState
@@ -74,9 +76,11 @@ class Interception:
         Our own component, which announces changes.
     log
         Takes the events.
+    feed
+        Told of poses, setpoints and states.
     """
 
-    def __init__(self, config: Config, *, identity: Identity, log: Log) -> None:
+    def __init__(self, config: Config, *, identity: Identity, log: Log, feed: Feed | None = None) -> None:
         guidance = config.guidance
         self.switch = Switch(
             guidance,
@@ -87,6 +91,7 @@ class Interception:
         self._config = config
         self._identity = identity
         self._log = log
+        self.feed = feed if feed is not None else Feed()
         self._poses = PoseBuffer(jump_m=guidance.estimator_jump_m)
         self._reference = GlobalReference()
         self._announced_unprotected: set[str] = set()
@@ -134,6 +139,9 @@ class Interception:
             self.statistics.frame_to_setpoint_ms.append(waited_ms)
             self._report_waiting = None
         self._last_verdict = verdict_fields(setpoint, verdict)
+        if self.feed.wants(Kind.SETPOINT):
+            fields = {"planner": f"{system_id}/{component_id}", "state": str(self.switch.state)}
+            self.feed.setpoint({**fields, **self._last_verdict}, now_ns)
         if self._config.log.setpoints:
             self._log.info(
                 "setpoint",
@@ -295,6 +303,7 @@ class Interception:
         speed_m_s = self._poses.speed_m_s()
         if pose is not None and speed_m_s is not None:
             self.switch.on_pose(pose, speed_m_s)
+            self.feed.pose(pose, speed_m_s)
 
     def autopilot_age_ms(self, now_ns: int) -> int | None:
         """Return the age of the autopilot's newest HEARTBEAT; None before the first."""
@@ -426,6 +435,7 @@ class Interception:
                         reason=event.reason,
                         time_ns=event.time_ns,
                     )
+                    self.feed.state(str(event.previous), str(event.state), event.reason, event.time_ns)
                     self._identity.status_text(_severity(event), f"void: {event.state} {event.reason}")
                 case GaveUp():
                     self._log.error("gave_up", reason=event.reason, ask_autopilot=event.ask_autopilot)

@@ -167,7 +167,11 @@ def wants_json(config: LogConfig, stream: TextIO | None) -> bool:
 
 @contextlib.contextmanager
 def open_log(
-    config: LogConfig, stream: TextIO | None = None, *, gate: LevelGate | None = None
+    config: LogConfig,
+    stream: TextIO | None = None,
+    *,
+    gate: LevelGate | None = None,
+    tap: Processor | None = None,
 ) -> Iterator[Log]:
     """Yield the service's logger; its lines are written out when the context ends.
 
@@ -182,6 +186,8 @@ def open_log(
         Where lines go; standard error where it is None. One without a file descriptor works too.
     gate
         What is logged, where that may change meanwhile; by default ``config.level`` for good.
+    tap
+        Sees every event that is logged, and returns it.
     """
     stream = sys.stderr if stream is None else stream
     as_json = wants_json(config, stream)
@@ -198,6 +204,7 @@ def open_log(
         structlog.processors.add_log_level,
         stamp,
         structlog.processors.format_exc_info,
+        *(() if tap is None else (tap,)),
         render,
     ]
     log = cast(

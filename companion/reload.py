@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from companion.clock import Clock
 from companion.config import Config, DetectorConfig
+from companion.config_file import config_of, merged
 from companion.config_reload_rules import Changes, changes_between, with_changes
 from companion.config_sources import ConfigPlaces, load
 from companion.errors import CompanionError, ConfigError
@@ -78,12 +79,51 @@ class Reload:
         self._clock = clock
         self._log = log
         self._wanted = asyncio.Event()
+        self._turn = asyncio.Lock()
         self._parameters = _digest(config.detector.params_file)
         self._seen = signature_of(places, config.detector.params_file)
 
     def request(self) -> None:
         """Ask for the configuration to be read again; :meth:`run` does it."""
         self._wanted.set()
+
+    async def apply(self, values: Mapping[str, Any]) -> Changes:
+        """Take single settings in flight, all or none; no file keeps them, and the next reload reads the files again.
+
+        Parameters
+        ----------
+        values
+            By dotted key.
+
+        Returns
+        -------
+        What was taken. Where some need a restart, these and why: then nothing was taken.
+
+        Raises
+        ------
+        companion.errors.CompanionError
+            When a value cannot be used, or a worker cannot be built from them; nothing was taken.
+        """
+        async with self._turn:
+            settings = self._settings
+            for _ in range(_MOST_READINGS):
+                revision = settings.revision
+                new = _with_values(settings.active, values)
+                changes = changes_between(settings.active, new)
+                if changes.refused:
+                    return changes
+                if changes.new_worker:
+                    await self._try_worker(new.detector, new)
+                if settings.revision != revision:
+                    continue  # a ground station was faster
+                settings.take(new, _with_values(settings.kept, values))
+                if self._gate is not None:
+                    self._gate.set_level(new.log.level)
+                if changes.new_worker:
+                    self._vision.replace(new.detector)
+                self._announce(changes, is_new_worker=bool(changes.new_worker))
+                return changes
+        raise ConfigError("a ground station keeps changing settings meanwhile: try again")
 
     async def run(self) -> None:
         """Read the configuration again whenever that is asked for, for ever."""
@@ -113,7 +153,8 @@ class Reload:
         """Take what may change; whatever is wrong with the rest, flying goes on with the old settings."""
         self._notifier.reloading(self._clock.now_ns())
         try:
-            await self._take()
+            async with self._turn:
+                await self._take()
         except CompanionError as error:
             self._log.error("config_rejected", error=str(error))
             self._say(MavSeverity.ERROR, f"void: settings not taken: {str(error).partition(chr(10))[0]}")
@@ -162,6 +203,17 @@ class Reload:
         if changes.refused:
             self._log.warning("config_needs_restart", reasons=dict(changes.refused))
             self._say(MavSeverity.WARNING, f"void: need a restart: {_few(sorted(changes.refused))}")
+
+
+def _with_values(config: Config, values: Mapping[str, Any]) -> Config:
+    """Return a configuration with single values changed, checked as a whole; raises ConfigError."""
+    table: dict[str, Any] = config.model_dump(exclude_unset=True)
+    for key, value in values.items():
+        section, _, name = key.partition(".")
+        if not name:
+            raise ConfigError(f"{key}: expected TABLE.KEY")
+        table = merged(table, {section: {name: value}})
+    return config_of(table, name="settings that were asked for")
 
 
 def signature_of(places: ConfigPlaces, params_file: str) -> Signature:

@@ -14,6 +14,7 @@ status         config     one line with all rates and ages
 status-socket  events     answers ``companion status`` and commands, where there is a place for its socket
 metrics        events     answers Prometheus, where that is switched on
 reload         events     reads the configuration again when asked, or when a file of it has changed
+io             50 Hz      owns the I/O process of recorder and live page: start, restart, what it is told; where one is on
 systemd        1 Hz       feeds its watchdog, only while health has run; where it started us
 =============  =========  ==============================================================================
 
@@ -40,8 +41,14 @@ from companion.frames.open import open_source
 from companion.frames.source import FrameSource
 from companion.guidance.observation import DetectionReport
 from companion.interception import Interception
+from companion.io.desk import ServiceDesk
+from companion.io.feed import Feed
+from companion.io.messages import Kind
+from companion.io.sinks import RECORDER, sinks_of
+from companion.io.supervisor import IoSupervisor
+from companion.io.taps import LatchedClock, LogTap, TappedLink
 from companion.log import LevelGate, Log
-from companion.mavlink.endpoint import Endpoint
+from companion.mavlink.endpoint import Endpoint, Link
 from companion.mavlink.endpoints import make_side
 from companion.mavlink.identity import Identity
 from companion.mavlink.network import Side
@@ -59,6 +66,7 @@ from companion.takeover import TakeoverFlight
 from companion.vision.supervisor import VisionSupervisor
 
 _HEALTH_PERIOD_NS: Final = 100_000_000
+_FEED_STATUS_NS: Final = 500_000_000
 _COMPONENT_PERIOD_NS: Final = 100_000_000
 _HEARTBEAT_PERIOD_NS: Final = 1_000_000_000
 _HEALTH_LATE_NS: Final = 1_000_000_000
@@ -89,6 +97,10 @@ class Service:
         What is logged, where a reload may change that.
     runtime_folder
         Where the status socket is made when the configuration names no place for it; None: nowhere.
+    feed
+        Told what happens, for a caller that listens itself; by default the I/O process listens, where one is on.
+    log_tap
+        What ``log`` was opened with, so that its lines are told too.
 
     Attributes
     ----------
@@ -109,7 +121,17 @@ class Service:
         places: ConfigPlaces | None = None,
         gate: LevelGate | None = None,
         runtime_folder: Path | None = None,
+        feed: Feed | None = None,
+        log_tap: LogTap | None = None,
     ) -> None:
+        self._is_listened_to = feed is not None or bool(sinks_of(config))
+        self._feed = feed if feed is not None else Feed()
+        self._feed_status: Callable[[int], None] = lambda _: None
+        self._feed_status_ns = 0
+        self._desk: ServiceDesk | None = None
+        self._io: IoSupervisor | None = None
+        if log_tap is not None:
+            log_tap.take = lambda event: self._feed.log(event, clock.now_ns())
         self.commands: dict[str, Command] = {}
         self.sections: dict[str, Section] = {}
         self._runtime_folder = runtime_folder
@@ -162,29 +184,32 @@ class Service:
                 await stack.enter_async_context(link)
             self._links = (*planner, *autopilot)
             signatures = open_signatures(config.link)
+            planner_links, autopilot_links, now_ns = self._tapped(planner, autopilot)
             identity = Identity(
-                Side(planner),
-                Side(autopilot),
+                Side(planner_links),
+                Side(autopilot_links),
                 component_id=config.link.component_id,
-                now_ns=clock.now_ns,
+                now_ns=now_ns,
                 signatures=signatures,
             )
-            flight = Interception(config, identity=identity, log=log)
+            flight = Interception(config, identity=identity, log=log, feed=self._feed)
+            began_ns = clock.now_ns()
+            self._feed.config(config, began_ns)
             own = Own(
                 config,
                 flight,
                 identity,
                 log=log,
-                now_ns=clock.now_ns(),
+                now_ns=began_ns,
                 apply=self._apply,
                 signatures=signatures,
             )
             takeover, tap = _way_of_interception(config, flight, identity, own, log, signatures)
             proxy = InlineProxy(
-                planner,
-                autopilot,
+                planner_links,
+                autopilot_links,
                 flight,
-                now_ns=clock.now_ns,
+                now_ns=now_ns,
                 signatures=signatures,
                 own=tap,
                 filters=config.link.filter_rules,
@@ -219,6 +244,8 @@ class Service:
                 )
                 loops["reload"] = self._reload.run()
             loops.update(self._status_loops(flight, own, proxy, vision))
+            loops.update(self._io_loops(identity))
+            self._feed_status = partial(self._tell_feed, flight, vision, proxy, own)
             if takeover is not None:
                 loops["takeover"] = takeover.run(clock)
             if self._notifier.enabled:
@@ -275,20 +302,65 @@ class Service:
             loops["metrics"] = metrics.run()
         return loops
 
+    def _tapped(
+        self, planner: Sequence[Endpoint], autopilot: Sequence[Endpoint]
+    ) -> tuple[Sequence[Link], Sequence[Link], Callable[[], int]]:
+        """Return the links as the proxy uses them, and its clock; where somebody may listen, the feed hears them."""
+        clock = self._clock
+        if not self._is_listened_to:
+            return planner, autopilot, clock.now_ns
+        latched = LatchedClock(clock.now_ns)
+        links = [
+            TappedLink(link, number, self._feed, latched)
+            for number, link in enumerate((*planner, *autopilot))
+        ]
+        return links[: len(planner)], links[len(planner) :], latched.now_ns
+
+    def _io_loops(self, identity: Identity) -> dict[str, Coroutine[Any, Any, None]]:
+        """Return the loop that owns the I/O process, where the configuration asks for one."""
+        sinks = sinks_of(self._config)
+        desk = self._desk = ServiceDesk(
+            self._feed,
+            identity,
+            now_ns=self._clock.now_ns,
+            has_recorder=RECORDER in sinks,
+            apply_settings=None if self._reload is None else self._reload.apply,
+        )
+        self.commands["record"] = desk.record
+        if not sinks:
+            return {}
+        if RECORDER in sinks:
+            self.sections["recorder"] = desk.recorder_status
+        self._io = IoSupervisor(
+            self._feed,
+            sinks,
+            self._config,
+            handlers=desk.handlers,
+            now_ns=self._clock.now_ns,
+            log=self._log,
+        )
+        return {"io": self._io.run()}
+
     def _apply(self, config: Config) -> None:
         """Take settings that were changed in flight."""
         self._config = config
+        self._feed.config(config, self._clock.now_ns())
+        if self._io is not None:
+            self._io.set_config(config)
 
     def _take_report(self, flight: Interception, report: DetectionReport) -> None:
         """Hand on a report. What fails there must not end the process in flight: to the switch S vision is silent."""
+        now_ns = self._clock.now_ns()
+        self._feed.detection(report, now_ns)
         try:
-            flight.on_report(report, self._clock.now_ns())
+            flight.on_report(report, now_ns)
         except Exception as error:  # noqa: BLE001  whatever fails there, setpoints must go on being decided
             if repr(error) != self._report_failure:  # once, not at the rate of the frames
                 self._report_failure = repr(error)
                 self._log.exception("report_failed", frame_seq=report.frame_seq)
 
     def _on_link_state(self, link: Endpoint) -> None:
+        self._feed.link(link.name, link.label, link.state, self._clock.now_ns())
         if link.state.startswith("waiting"):
             self._log.warning("link_state", link=link.name, url=link.label, state=link.state)
         else:
@@ -316,6 +388,7 @@ class Service:
                         self._source_fault = None
                         failures = 0
                         vision.offer(frame, flight.pose_of(frame, now_ns))
+                        self._feed.frame(frame, now_ns)
                 self._source_fault = "frame source has ended"
                 log.warning("source_ended")
                 if config.scheme == "file":
@@ -345,12 +418,14 @@ class Service:
                     camera = self._with_reason("no frames from the camera")
                 elif self._too_slow:
                     camera = "frame rate below the floor"
-            flight.set_fault("camera", camera, now_ns)
             status = vision.status
             worker = None if status.state in ("ready", "busy") else f"vision worker {status.state}"
+            self._feed.loop("health", now_ns, {"camera": camera, "worker": worker})
+            flight.set_fault("camera", camera, now_ns)
             flight.set_fault("worker", worker, now_ns)
             flight.check_links(now_ns)
             flight.announce()
+            self._feed_status(now_ns)
             self._health_ns = now_ns
             self._health_has_run = True
             await clock.sleep_until_ns(now_ns + _HEALTH_PERIOD_NS)
@@ -365,6 +440,7 @@ class Service:
         while True:
             now_ns = self._clock.now_ns()
             if now_ns - self._health_ns <= _HEALTH_LATE_NS:
+                self._feed.loop("heartbeat", now_ns, {})
                 identity.heartbeat(flight.mav_state(now_ns))
             await self._clock.sleep_until_ns(now_ns + _HEARTBEAT_PERIOD_NS)
 
@@ -385,8 +461,32 @@ class Service:
         """Let our own component send what is due."""
         while True:
             now_ns = self._clock.now_ns()
+            self._feed.loop("component", now_ns, {})
             own.component.tick(now_ns)
             await self._clock.sleep_until_ns(now_ns + _COMPONENT_PERIOD_NS)
+
+    def _tell_feed(
+        self, flight: Interception, vision: VisionSupervisor, proxy: InlineProxy, own: Own, now_ns: int
+    ) -> None:
+        """Tell who listens how the service is."""
+        if self._desk is not None:
+            self._desk.note_armed(flight.armed, now_ns)
+        if self._feed.wants(Kind.STATUS) and now_ns >= self._feed_status_ns:
+            self._feed_status_ns = now_ns + _FEED_STATUS_NS
+            self._feed.status(self._status_fields(flight, vision, proxy, own, now_ns), now_ns)
+
+    def _status_fields(
+        self, flight: Interception, vision: VisionSupervisor, proxy: InlineProxy, own: Own, now_ns: int
+    ) -> dict[str, Any]:
+        return {
+            **flight.status(now_ns),
+            **own.status(now_ns),
+            "armed": flight.armed,
+            "worker": vision.status.state,
+            "worker_restarts": vision.status.restarts,
+            "links": {link.name: link.status() for link in self._links},
+            **proxy.counters.as_dict(),
+        }
 
     async def _status(
         self, flight: Interception, vision: VisionSupervisor, proxy: InlineProxy, own: Own
@@ -397,15 +497,8 @@ class Service:
             return
         while True:
             await self._clock.sleep_until_ns(self._clock.now_ns() + int(interval_s * 1e9))
-            self._log.info(
-                "status",
-                **flight.status(self._clock.now_ns()),
-                **own.status(self._clock.now_ns()),
-                worker=vision.status.state,
-                worker_restarts=vision.status.restarts,
-                links={link.name: link.status() for link in self._links},
-                **proxy.counters.as_dict(),
-            )
+            now_ns = self._clock.now_ns()
+            self._log.info("status", **self._status_fields(flight, vision, proxy, own, now_ns))
 
 
 def _way_of_interception(

@@ -68,6 +68,11 @@ class Settings:
         return self._active
 
     @property
+    def kept(self) -> Config:
+        """The configuration that will act after a restart."""
+        return self._kept
+
+    @property
     def unsaved(self) -> dict[str, Value]:
         """Values by dotted key that may not be in the parameters' file yet."""
         return {**self._writing, **self._unsaved}

@@ -190,6 +190,7 @@ class TakeoverFlight:
         period_ns = round(1e9 / self._config.interception.stream_rate_hz)
         while True:
             now_ns = clock.now_ns()
+            self._flight.feed.loop("takeover", now_ns, {})
             self.tick(now_ns)
             await clock.sleep_until_ns(now_ns + period_ns)
 

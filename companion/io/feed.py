@@ -25,7 +25,6 @@ Direction = Literal["in", "out"]
 
 _PACKET_BYTES: Final = 60_000
 """Packets are filled up to here: some of them fit into the kernel's buffer."""
-_RETAINED: Final = frozenset({Kind.CONFIG, Kind.STATE, Kind.LINK})
 _report_json: Final = TypeAdapter(DetectionReport)
 
 _Item = tuple[Kind, int, int, Any, bytes]
@@ -150,9 +149,9 @@ class Feed:
         """Tell the configuration that acts from now on."""
         self._put(Kind.CONFIG, now_ns, config, retained_as="config")
 
-    def control(self, name: str, fields: Mapping[str, Any], now_ns: int) -> None:
-        """Tell all sinks to do something, such as to begin a recording."""
-        self._put(Kind.CONTROL, now_ns, {"name": name, **fields})
+    def control(self, name: str, fields: Mapping[str, Any], now_ns: int, *, retain: bool = False) -> None:
+        """Tell all sinks to do something, such as to begin a recording; retained, also those that are started later."""
+        self._put(Kind.CONTROL, now_ns, {"name": name, **fields}, retained_as=name if retain else None)
 
     def answer(self, number: int, answer: Answer, now_ns: int) -> None:
         """Answer a sink's request."""
@@ -170,6 +169,9 @@ class Feed:
         """Forget what waits and who listened: another process will say what it wants."""
         self._queues.clear()
         self._kinds = ALWAYS
+        for (kind, _), item in self._retained.items():
+            if kind in ALWAYS:
+                self._queues.put(kind, item[2], item)
         if self._ring is not None:
             self._announce_ring(self._ring)
 

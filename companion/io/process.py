@@ -146,6 +146,12 @@ class IoProcess:
         """
         self._connection.close()
         try:
+            return self._wait(grace_s)
+        finally:
+            self._output.close()
+
+    def _wait(self, grace_s: float) -> int | None:
+        try:
             return self._process.wait(grace_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
@@ -153,8 +159,6 @@ class IoProcess:
             return self._process.wait(_GONE_S)
         except subprocess.TimeoutExpired:  # in uninterruptible I/O; it dies as soon as that ends
             return None
-        finally:
-            self._output.close()
 
 
 def _environment() -> dict[str, str]:

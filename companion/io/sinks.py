@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from companion.config import Config
+
+RECORDER: Final = "companion.recorder.sink:build"
 
 
 def sinks_of(config: Config) -> tuple[str, ...]:
     """Return the names (``package.module:factory``) of the sinks to run; where there is none, no process is started."""
     names: list[str] = []
     if config.recorder.start != "never":
-        names.append("companion.recorder.sink:build")
+        names.append(RECORDER)
     return tuple(names)

@@ -65,7 +65,8 @@ class IoSupervisor:
     now_ns
         The service's monotonic time.
     log
-        Takes ``io_started``, ``io_died``, ``io_unusable``, ``io_output``, and what the sinks log.
+        Takes ``io_started``, ``io_died``, ``io_unusable``, ``io_output``, ``io_failed``, ``io_request_failed``, and what the
+        sinks log.
     """
 
     def __init__(
@@ -134,6 +135,8 @@ class IoSupervisor:
                 )
                 await asyncio.sleep(delay_s)
                 self._restarts += 1
+        except Exception:  # noqa: BLE001  a fault in here must not end the flight: it goes on without
+            self._log.exception("io_failed")
         finally:
             self._feed.want(Wants())
             for task in self._tasks:

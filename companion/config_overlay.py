@@ -53,13 +53,19 @@ def write_overlay(path: Path, changes: Mapping[str, Value]) -> None:
         section, _, key = dotted.partition(".")
         table = merged(table, {section: {key: value}})
     try:
-        _replace(path, overlay_text(table).encode())
+        replace_file(path, overlay_text(table).encode())
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _replace(path: Path, data: bytes) -> None:
-    """Write a file beside the old one, to the disk, and then put it in its place."""
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file beside the old one, to the disk, and then put it in its place.
+
+    Raises
+    ------
+    OSError
+        When it cannot be written; the old one is then as it was.
+    """
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     new = Path(name)
     try:

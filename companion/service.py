@@ -219,7 +219,13 @@ class Service:
                 self._take_report(flight, report)
 
             vision = VisionSupervisor(
-                config.detector, config.camera, clock=clock, on_report=on_report, log=log
+                config.detector,
+                config.camera,
+                clock=clock,
+                on_report=on_report,
+                log=log,
+                on_details=lambda details: self._feed.details(details.fields, details.data, clock.now_ns()),
+                wants_details=lambda: self._feed.wants(Kind.DETAILS),
             )
             loops: dict[str, Coroutine[Any, Any, None]] = {
                 "frames": self._frames(flight, vision),

@@ -111,8 +111,8 @@ class Feed:
         if Kind.DETECTION in self._kinds:
             self._put(Kind.DETECTION, now_ns, report)
 
-    def details(self, fields: Mapping[str, Any], data: bytes, now_ns: int) -> None:
-        """Tell what the detector saw on the way to its last report."""
+    def details(self, fields: bytes, data: bytes, now_ns: int) -> None:
+        """Tell what the detector saw on the way to its last report: JSON and bytes, as the worker made them."""
         if Kind.DETAILS in self._kinds:
             self._put(Kind.DETAILS, now_ns, fields, data)
 
@@ -236,6 +236,8 @@ class Feed:
 def _fields_of(content: Any) -> bytes:
     """Return what was published as a JSON object; numbers that JSON does not know become text."""
     match content:
+        case bytes():
+            return content
         case DetectionReport():
             return _report_json.dump_json(content)
         case Config():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from companion.errors import ConfigError
 from companion.frames.source import Frame
 from companion.guidance.coordinates import r_body_from_camera, r_ned_from_body, wrap_rad
 from companion.guidance.observation import BearingRange, DetectionReport, Pose
+from companion.vision.details import Arrays, KeepingDetector, details_of, paper_arrays
 from detector.camera_model import CameraError, CameraModel
 from detector.observer import CameraPose, MetricRange, Observation, ObserverParams, VoidObserver
 from detector.params import DetectorParams, ParamsError
@@ -101,6 +102,8 @@ class VoidPipeline:
         Its size, and how far apart the frames of a pair are taken.
     """
 
+    _method = "paper"
+
     def __init__(
         self,
         params: DetectorParams,
@@ -119,6 +122,8 @@ class VoidPipeline:
         )
         self._model: CameraModel | None = None
         self._observer: FrameObserver | None = None
+        self._last: Observation | None = None
+        self._detector: KeepingDetector | None = None
 
     def detect(self, frame: Frame, pose: Pose | None) -> DetectionReport:
         """Return the report on one frame. A frame of another size starts anew."""
@@ -148,7 +153,7 @@ class VoidPipeline:
             if pose is None or r_ned_from_camera is None
             else CameraPose(r_ned_from_camera, np.array([pose.north_m, pose.east_m, pose.down_m]))
         )
-        observation = observer.observe(frame.image, frame.time_ns, camera_pose)
+        observation = self._last = observer.observe(frame.image, frame.time_ns, camera_pose)
         return self._report(frame, pose, observation, model, r_ned_from_camera, began_s)
 
     def between_frames(self) -> None:
@@ -156,8 +161,23 @@ class VoidPipeline:
         if self._observer is not None:
             self._observer.between_frames()
 
+    def details(self) -> tuple[dict[str, Any], Arrays]:
+        """Return what was seen on the way to the last report (``companion.vision.details``)."""
+        if self._last is None:
+            return {}, {}
+        return {"method": self._method, **details_of(self._last)}, self._arrays(self._last)
+
+    def _arrays(self, observation: Observation) -> Arrays:
+        kept = self._detector.last if self._detector is not None else None
+        if kept is None or observation.earlier_time_ns is None:
+            return {}
+        return paper_arrays(observation, *kept, self._params)
+
     def _observer_of(self, model: CameraModel) -> FrameObserver:
-        return VoidObserver(self._params, model, observer_params=self._observer_params)
+        self._detector = KeepingDetector(self._params)
+        return VoidObserver(
+            self._params, model, observer_params=self._observer_params, detector=self._detector
+        )
 
     def _model_for(self, width_px: int, height_px: int) -> CameraModel:
         if self._calibrated is None:

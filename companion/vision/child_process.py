@@ -17,10 +17,12 @@ import traceback
 
 from companion.errors import ConfigError
 from companion.frames.source import Frame
+from companion.io.messages import pack_arrays
 from companion.vision.frame_slots import MappedSlots
 from companion.vision.messages import (
     MAX_PACKET_BYTES,
     Answer,
+    Details,
     Detect,
     Failed,
     FromWorker,
@@ -32,7 +34,7 @@ from companion.vision.messages import (
     pack_from_worker,
     unpack_to_worker,
 )
-from companion.vision.pipeline import Pipeline, WithIdleWork, load_factory
+from companion.vision.pipeline import Pipeline, WithDetails, WithIdleWork, load_factory
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _MAX_TRACEBACK = 20_000
@@ -77,6 +79,8 @@ def _serve(connection: socket.socket) -> int:
                 image = slots.read(message.slot, message.height_px, message.width_px)
                 report = pipeline.detect(Frame(image, message.time_ns, message.seq), message.pose)
                 _send(connection, Answer(message.frame_id, report))
+                if message.details and isinstance(pipeline, WithDetails):
+                    _send_details(connection, message, pipeline)
                 if isinstance(pipeline, WithIdleWork):
                     pipeline.between_frames()
     return 0
@@ -88,6 +92,17 @@ def _receive(connection: socket.socket) -> tuple[ToWorker, list[int]] | None:
     except ConnectionError:
         return None
     return (unpack_to_worker(packet), fds) if packet else None
+
+
+def _send_details(connection: socket.socket, message: Detect, pipeline: WithDetails) -> None:
+    fields, arrays = pipeline.details()
+    layout, data = pack_arrays(arrays)
+    fields = {"frame_seq": message.seq, "frame_ns": message.time_ns, **fields, "arrays": layout}
+    from companion.log import json_line  # structlog, which nothing else here needs
+
+    packet = pack_from_worker(Details(json_line(None, "", fields).encode(), data))
+    if len(packet) <= MAX_PACKET_BYTES:
+        connection.send(packet)
 
 
 def _send(connection: socket.socket, message: FromWorker) -> None:

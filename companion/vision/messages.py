@@ -6,8 +6,9 @@ One message is one packet of JSON on a socket that keeps packets apart; pixels n
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -52,6 +53,8 @@ class Detect:
     seq: int
     time_ns: int
     pose: Pose | None
+    details: bool = False
+    """Whether somebody wants to know what the detector saw on the way."""
     kind: Literal["detect"] = "detect"
 
 
@@ -80,6 +83,21 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
+class Details:
+    """From the worker, behind an answer where that was asked for: what the detector saw on the way to it.
+
+    Attributes
+    ----------
+    fields, data
+        For ``companion.io``, as they are: nothing here reads them.
+    """
+
+    fields: bytes
+    data: bytes
+    kind: Literal["details"] = "details"
+
+
+@dataclass(frozen=True, slots=True)
 class Failed:
     """From the worker, last: an exception ended it."""
 
@@ -89,10 +107,17 @@ class Failed:
 
 
 ToWorker = Start | MapSlots | Detect
-FromWorker = Ready | Unusable | Answer | Failed
+_FromWorkerJson = Ready | Unusable | Answer | Failed
+FromWorker = _FromWorkerJson | Details
+
+_DETAILS: Final = b"D"
+"""Details are no JSON: they are long, and only pass through."""
+_LENGTH: Final = struct.Struct("<cI")
 
 _to_worker: TypeAdapter[ToWorker] = TypeAdapter(Annotated[ToWorker, Field(discriminator="kind")])
-_from_worker: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(discriminator="kind")])
+_from_worker: TypeAdapter[_FromWorkerJson] = TypeAdapter(
+    Annotated[_FromWorkerJson, Field(discriminator="kind")]
+)
 
 
 def pack_to_worker(message: ToWorker) -> bytes:
@@ -107,6 +132,8 @@ def unpack_to_worker(packet: bytes) -> ToWorker:
 
 def pack_from_worker(message: FromWorker) -> bytes:
     """Return the packet of a message from the worker."""
+    if isinstance(message, Details):
+        return _LENGTH.pack(_DETAILS, len(message.fields)) + message.fields + message.data
     return _from_worker.dump_json(message)
 
 
@@ -118,8 +145,20 @@ def unpack_from_worker(packet: bytes) -> FromWorker:
     MessageError
         When it is none of the messages.
     """
+    if packet[:1] == _DETAILS:
+        return _details(packet)
     try:
         return _from_worker.validate_json(packet)
     except ValidationError as error:
         first = error.errors()[0]
         raise MessageError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+
+
+def _details(packet: bytes) -> Details:
+    begin = _LENGTH.size
+    if len(packet) < begin:
+        raise MessageError("details cut short")
+    end = begin + int(_LENGTH.unpack_from(packet)[1])
+    if len(packet) < end:
+        raise MessageError("details cut short")
+    return Details(packet[begin:end], packet[end:])

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from typing import Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
+
+from numpy.typing import NDArray
 
 from companion.config import CameraConfig, DetectorConfig
 from companion.errors import ConfigError
@@ -32,6 +34,15 @@ class WithIdleWork(Protocol):
 
     def between_frames(self) -> None:
         """Do so; called after each report. An exception is reported and ends the process."""
+        ...
+
+
+@runtime_checkable
+class WithDetails(Protocol):
+    """A pipeline that can tell what it saw on the way to its last report."""
+
+    def details(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return plain values and arrays by name; called behind the report, where somebody wants to know."""
         ...
 
 

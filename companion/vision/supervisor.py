@@ -27,6 +27,7 @@ from companion.vision.backoff import RestartBackoff
 from companion.vision.frame_slots import N_SLOTS, FrameSlots
 from companion.vision.messages import (
     Answer,
+    Details,
     Detect,
     Failed,
     FromWorker,
@@ -95,6 +96,10 @@ class VisionSupervisor:
         ``frame_refused``.
     pipeline
         ``package.module:factory`` of what the worker runs (``companion.vision.pipeline``).
+    on_details
+        Called with what the detector saw on the way to a report, behind that report; None: nobody looks.
+    wants_details
+        Asked with each frame whether somebody does: it takes the worker some milliseconds.
     """
 
     def __init__(
@@ -106,7 +111,11 @@ class VisionSupervisor:
         on_report: Callable[[DetectionReport], None],
         log: Log,
         pipeline: str = VOID_PIPELINE,
+        on_details: Callable[[Details], None] | None = None,
+        wants_details: Callable[[], bool] = lambda: False,
     ) -> None:
+        self._on_details = on_details
+        self._wants_details = wants_details
         self._detector = detector
         self._camera = camera
         self._pipeline = pipeline
@@ -173,7 +182,14 @@ class VisionSupervisor:
         slots.write(slot, image)
         height_px, width_px = image.shape
         self._waiting = Detect(
-            self._offered, slot, height_px, width_px, frame.seq, frame.time_ns, _finite_or_none(pose)
+            self._offered,
+            slot,
+            height_px,
+            width_px,
+            frame.seq,
+            frame.time_ns,
+            _finite_or_none(pose),
+            self._on_details is not None and self._wants_details(),
         )
         self._dispatch()
 
@@ -287,6 +303,9 @@ class VisionSupervisor:
                     self._state = "ready"
                     self._last_report_ns = self._clock.now_ns()
                     self._on_report(message.report)
+                case Details():
+                    if self._on_details is not None:
+                        self._on_details(message)
                 case _Replaced():
                     return _Death("settings changed", is_wanted=True)
                 case Unusable() if not self._was_ready.is_set():

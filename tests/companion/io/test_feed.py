@@ -95,7 +95,7 @@ def test_packets_hold_many_messages_and_stay_short():
 def test_a_message_too_long_for_a_packet_is_counted():
     feed = Feed()
     feed.want(everything())
-    feed.details({"arrays": []}, bytes(1 << 18), 1)
+    feed.details(b"{}", bytes(1 << 18), 1)
     feed.state("a", "b", "c", 2)
     assert [message.kind for message in drain(feed)] == [Kind.STATE]
     assert feed.dropped == {"details": 1}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from companion.config import CameraConfig
 from companion.frames.source import Frame
 from companion.guidance.observation import BearingRange, DetectionReport, Pose
 from companion.vision.child import BEARING_STEP_RAD, FrameObserver, Vector, VoidPipeline, obstacles_seen
+from companion.vision.details import Arrays, parallax_arrays
 from detector.camera_model import CameraModel
 from detector.observer import Observation, ObserverParams
 from detector.parallax.samples import RangedSamples
@@ -37,6 +39,8 @@ class ParallaxPipeline(VoidPipeline):
         Its size, and how far apart the frames of a pair are taken.
     """
 
+    _method = "parallax"
+
     def __init__(self, camera: CameraConfig, calibrated: CameraModel | None, vehicle: ObserverParams) -> None:
         super().__init__(DetectorParams.preset("default"), camera, calibrated, vehicle)
         self._vehicle = vehicle
@@ -44,6 +48,22 @@ class ParallaxPipeline(VoidPipeline):
         self._map_params = VoidMapParams(
             radius_m=0.5 * vehicle.vehicle_width_m, half_height_m=0.5 * vehicle.vehicle_height_m
         )
+
+    def details(self) -> tuple[dict[str, Any], Arrays]:
+        """Return what was seen on the way to the last report (``companion.vision.details``)."""
+        fields, arrays = super().details()
+        reading = None if self._last is None else reading_of(self._last)
+        if reading is None:
+            return fields, arrays
+        gap = reading.gap
+        if gap is not None:
+            fields["gap"] = {
+                "azimuth_rad": gap.azimuth_rad,
+                "free_m": gap.free_m,
+                "sigma_m": gap.sigma_m,
+                "width_rad": gap.width_rad,
+            }
+        return fields, parallax_arrays(reading)
 
     def _observer_of(self, model: CameraModel) -> FrameObserver:
         return ParallaxObserver(

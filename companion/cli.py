@@ -16,6 +16,7 @@ from companion.errors import CompanionError, first_of
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0 done, 1 failed, 2 wrong usage."""
+    _fill_standard_descriptors()
     words = list(sys.argv[1:] if argv is None else argv)
     own_parser = _OWN_PARSERS.get(words[0]) if words else None
     arguments = own_parser().parse_args(words[1:]) if own_parser else _parser().parse_args(words)
@@ -27,6 +28,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return code
+
+
+def _fill_standard_descriptors() -> None:
+    """Open what was closed of 0 to 2: a socket that got number 2 would be sent what libraries write to standard error."""
+    while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(fd, True)
+    os.close(fd)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -73,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("status", help="what the running service says of itself", add_help=False)
     commands.add_parser("doctor", help="say what is missing before a flight, and what to do", add_help=False)
     commands.add_parser("calibrate", help="make or judge a camera file with a board", add_help=False)
+    commands.add_parser("web", help="the page with recordings: compare settings on them", add_help=False)
     return parser
 
 
@@ -112,6 +121,12 @@ def _calibrate_parser() -> argparse.ArgumentParser:
     return calibrate_parser()
 
 
+def _web_parser() -> argparse.ArgumentParser:
+    from companion.web.command import web_parser
+
+    return web_parser()
+
+
 _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
     "config": _config_parser,
     "sim": _sim_parser,
@@ -119,6 +134,7 @@ _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
     "doctor": _doctor_parser,
     "calibrate": _calibrate_parser,
     "status": _status_parser,
+    "web": _web_parser,
 }
 """Commands whose modules import much that nothing else needs."""
 

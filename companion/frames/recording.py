@@ -125,6 +125,11 @@ class ImageFolder:
             raise SourceError(f"{table}: none of the {len(self._names)} listed images exists")
         self._at = 0
 
+    @property
+    def offsets_ns(self) -> tuple[int, ...]:
+        """Time of each image since the first."""
+        return tuple(self._offsets_ns)
+
     def skip_until(self, offset_ns: int) -> int:
         """Pass over images that have a successor due by ``offset_ns``; return how many."""
         before = self._at

@@ -7,6 +7,7 @@ from typing import Final
 from companion.config import Config
 
 RECORDER: Final = "companion.recorder.sink:build"
+WEB: Final = "companion.web.sink:build"
 
 
 def sinks_of(config: Config) -> tuple[str, ...]:
@@ -14,4 +15,6 @@ def sinks_of(config: Config) -> tuple[str, ...]:
     names: list[str] = []
     if config.recorder.start != "never":
         names.append(RECORDER)
+    if config.web.enabled:
+        names.append(WEB)
     return tuple(names)

@@ -20,6 +20,9 @@ _FAR_M: Final = 8.0
 _NEAR_M: Final = 0.7
 _STRIP_SHARE: Final = 0.05
 _RINGS_M: Final = (1.0, 2.0, 4.0, 8.0, 16.0)
+_RINGS_BASELINES: Final = (5.0, 10.0, 20.0, 40.0, 80.0)
+BASELINE_M: Final = 0.2
+"""What colours take a baseline for where its length is not known."""
 _HALF_BIN_RAD: Final = math.pi / BINS
 
 
@@ -72,12 +75,13 @@ def draw_map_over(
     (H zoom, W zoom, 3) uint8, BGR.
     """
     canvas = FrameCanvas(image, zoom)
+    unit_m = _unit_m(found.metric)
     if samples is not None:
         for (x, y), inverse, tells in zip(
             samples.pixels_px, samples.inverse_range, samples.informative, strict=True
         ):
             if tells:
-                canvas.disc((x, y), 1, range_colour(1.0 / max(float(inverse), 1e-3)), rim_width=0)
+                canvas.disc((x, y), 1, range_colour(unit_m / max(float(inverse), 1e-3)), rim_width=0)
     height = _STRIP_SHARE * image.shape[0]
     for index in range(BINS):
         azimuth = float(found.azimuth_rad[index])
@@ -91,7 +95,9 @@ def draw_map_over(
         )
         placed = np.rint(corners * zoom).astype(np.int32)
         if found.known[index]:
-            cv2.fillPoly(canvas.picture, [placed], range_colour(float(found.free_m[index])), cv2.LINE_AA)
+            cv2.fillPoly(
+                canvas.picture, [placed], range_colour(unit_m * float(found.free_m[index])), cv2.LINE_AA
+            )
         else:
             cv2.polylines(canvas.picture, [placed], True, GREY, 1, cv2.LINE_AA)
     if gap is not None:
@@ -124,7 +130,7 @@ def draw_map_from_above(
     size_px
         Side of the picture.
     reach_m
-        Distance at its rim.
+        Distance at its rim, in the map's unit.
 
     Returns
     -------
@@ -132,6 +138,7 @@ def draw_map_from_above(
     """
     picture = np.full((size_px, size_px, 3), 255, np.uint8)
     middle, scale = 0.5 * size_px, 0.46 * size_px / reach_m
+    unit_m = _unit_m(found.metric)
 
     def place(azimuth: float, metres: float) -> tuple[int, int]:
         turned = azimuth - heading_rad
@@ -148,9 +155,9 @@ def draw_map_from_above(
             place(azimuth - _HALF_BIN_RAD, free),
             place(azimuth + _HALF_BIN_RAD, free),
         ]
-        cv2.fillPoly(picture, [np.array(wedge, np.int32)], range_colour(float(found.free_m[index])))
+        cv2.fillPoly(picture, [np.array(wedge, np.int32)], range_colour(unit_m * float(found.free_m[index])))
     unit = "m" if found.metric else "baselines"
-    for ring_m in _RINGS_M:
+    for ring_m in _RINGS_M if found.metric else _RINGS_BASELINES:
         if ring_m <= reach_m:
             cv2.circle(picture, place(0.0, 0.0), round(scale * ring_m), GREY, 1, cv2.LINE_AA)
             put_text(
@@ -171,6 +178,10 @@ def draw_map_from_above(
         words += f", confidence {confidence:.2f}"
     put_text(picture, words, (8, size_px - 10), scale=0.5, colour=INK)
     return picture
+
+
+def _unit_m(metric: bool) -> float:
+    return 1.0 if metric else BASELINE_M
 
 
 def _pixel_at(

@@ -94,6 +94,8 @@ class ParallaxResult:
         What was measured; None where the pair told nothing.
     decision
         The map behind the answer; None where there is none.
+    field
+        All samples of the flow; None where a frame could not be used.
     """
 
     detection: Detection
@@ -101,6 +103,7 @@ class ParallaxResult:
     focus_px: tuple[float, float] | None
     geometry: PairGeometry | None = None
     decision: Decision | None = None
+    field: FlowField | None = None
 
 
 class ParallaxDetector:
@@ -211,10 +214,10 @@ class ParallaxDetector:
             detail = (
                 f"{textured} of {len(field)} samples have texture, at least {params.least_informative} needed"
             )
-            return _nothing(NoDetectionReason.TOO_LITTLE_TEXTURE, detail, counts)
+            return _nothing(NoDetectionReason.TOO_LITTLE_TEXTURE, detail, counts, field)
         if believed < params.least_informative:
             detail = f"{believed} samples were found again, at least {params.least_informative} needed"
-            return _nothing(NoDetectionReason.TOO_LITTLE_FLOW, detail, counts)
+            return _nothing(NoDetectionReason.TOO_LITTLE_FLOW, detail, counts, field)
         left_rad = parallax_left_rad(field)
         baseline_m = None if translation_earlier_m is None else float(np.linalg.norm(translation_earlier_m))
         # A camera that is known to have moved and sees no parallax looks at something far away.
@@ -224,7 +227,7 @@ class ParallaxDetector:
             detail = (
                 f"a turn alone leaves {1e3 * left_rad:.2f} mrad of flow, limit {1e3 * limit_rad:.2f} mrad"
             )
-            return _nothing(NoDetectionReason.NO_MOTION, detail, counts)
+            return _nothing(NoDetectionReason.NO_MOTION, detail, counts, field)
         direction = (
             None
             if translation_earlier_m is None or later_from_earlier is None or not moved
@@ -239,6 +242,7 @@ class ParallaxDetector:
                 NoDetectionReason.TOO_LITTLE_FLOW,
                 "too few samples within the lens",
                 counts,
+                field,
             )
         plane = fit_plane(field, params, motion=motion)
         clock.step("plane")
@@ -254,7 +258,7 @@ class ParallaxDetector:
         clock.step("map")
         diagnostics = replace(counts, focus_of_expansion_px=estimate.focus_px, motion=estimate)
         return ParallaxResult(
-            decision.answer(diagnostics), _tracks(field, motion), estimate.focus_px, geometry, decision
+            decision.answer(diagnostics), _tracks(field, motion), estimate.focus_px, geometry, decision, field
         )
 
     def _frame(self, name: str, image: NDArray[np.uint8] | Frame) -> Frame:
@@ -327,8 +331,10 @@ def _tracks(field: FlowField, motion: Egomotion) -> Tracks:
     return Tracks(start[seen], used.later_px[seen])
 
 
-def _nothing(reason: NoDetectionReason, detail: str, diagnostics: Diagnostics) -> ParallaxResult:
-    return ParallaxResult(NoDetection(reason, detail, diagnostics), _NO_TRACKS, None)
+def _nothing(
+    reason: NoDetectionReason, detail: str, diagnostics: Diagnostics, field: FlowField | None = None
+) -> ParallaxResult:
+    return ParallaxResult(NoDetection(reason, detail, diagnostics), _NO_TRACKS, None, field=field)
 
 
 def _size(frame: Frame) -> str:

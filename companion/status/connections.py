@@ -71,6 +71,8 @@ class Connections:
             self._open.add(task)
             with contextlib.suppress(OSError, ValueError, TimeoutError):
                 await self._converse(reader, writer)
+        except asyncio.CancelledError:
+            pass  # serve() is over; asyncio's streams of Python 3.11 would log it as a failure of ours
         except Exception:  # noqa: BLE001  flying goes on whatever is wrong with the telling of it
             if not self._has_failed:
                 self._has_failed = True

@@ -218,6 +218,18 @@ async def test_a_client_that_asks_without_end_takes_turns_with_the_loop(tmp_path
         writer.close()
 
 
+async def test_the_end_of_the_service_hangs_up_on_clients_and_is_no_failure(tmp_path, caplog):
+    bench = Bench(tmp_path)
+    async with bench.running():
+        reader, writer = await asyncio.open_unix_connection(bench.path)
+        writer.write(pack_request(Request("status")))
+        await asyncio.wait_for(reader.readline(), DEADLINE_S)
+    assert await asyncio.wait_for(reader.read(), DEADLINE_S) == b""
+    writer.close()
+    assert caplog.records == []
+    assert bench.events("status_failed") == []
+
+
 async def test_a_fault_in_the_snapshot_is_logged_once_and_ends_nothing(tmp_path):
     async def broken():
         raise ZeroDivisionError

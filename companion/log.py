@@ -1,7 +1,7 @@
 """Structured logs: text for people on a terminal, one JSON object a line for everything else.
 
 An event is a stable snake_case name with fields: ``log.info("worker_ready", pid=412)``. In JSON every line
-has ``event``, ``level``, ``time`` (ISO 8601, UTC) and the fields.
+has ``event``, ``level``, ``time`` (ISO 8601, UTC) and the fields. systemd's journal is told each line's priority.
 
 Writing never blocks the caller: lines go through a bounded queue to one writer thread. When the sink
 stalls (a full pipe, a stopped terminal), lines are dropped and counted, and ``log_lines_dropped`` says so as
@@ -37,6 +37,15 @@ _FLUSH_S = 1.0
 _RETRY_S = 0.5
 _MAX_DEPTH = 6
 _SEVERITY = {"debug": 10, "info": 20, "warning": 30, "warn": 30, "error": 40, "exception": 40, "critical": 50}
+_JOURNAL_PRIORITY = {
+    "debug": 7,
+    "info": 6,
+    "warning": 4,
+    "warn": 4,
+    "error": 3,
+    "exception": 3,
+    "critical": 2,
+}
 
 
 class LevelGate:
@@ -165,6 +174,16 @@ def wants_json(config: LogConfig, stream: TextIO | None) -> bool:
         return True
 
 
+def is_journal(stream: TextIO | None) -> bool:
+    """Return whether a stream leads to systemd's journal: ``JOURNAL_STREAM`` names its file then (systemd.exec)."""
+    device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
+    try:
+        found = os.fstat(stream.fileno()) if stream is not None and device else None
+    except (OSError, ValueError):  # not a file, or closed
+        return False
+    return found is not None and (device, inode) == (str(found.st_dev), str(found.st_ino))
+
+
 @contextlib.contextmanager
 def open_log(
     config: LogConfig,
@@ -191,7 +210,9 @@ def open_log(
     """
     stream = sys.stderr if stream is None else stream
     as_json = wants_json(config, stream)
-    render = json_line if as_json else _console_renderer(stream)
+    render: Processor = json_line if as_json else _console_renderer(stream)
+    if is_journal(stream):
+        render = _with_priority(render)
     stamp = structlog.processors.TimeStamper(fmt="iso", utc=True, key="time")
 
     def dropped_line(lines: int) -> str:
@@ -251,6 +272,17 @@ def _plain(value: object, depth: int) -> object:
     if depth > 0 and isinstance(value, list | tuple | set | frozenset):
         return [_plain(item, depth - 1) for item in value]
     return repr(value)
+
+
+def _with_priority(render: Processor) -> Processor:
+    """Put the priority before each line that the journal takes off again and keeps (sd-daemon(3))."""
+
+    def rendered(logger: WrappedLogger, method: str, event: EventDict) -> str:
+        return (
+            f"<{_JOURNAL_PRIORITY.get(method, _JOURNAL_PRIORITY['error'])}>{render(logger, method, event)!s}"
+        )
+
+    return rendered
 
 
 def _console_renderer(stream: TextIO | None) -> structlog.dev.ConsoleRenderer:

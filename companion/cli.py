@@ -79,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("sim", help="fly closed loop in a simulated indoor world", add_help=False)
     commands.add_parser("cameras", help="list cameras, take a picture, measure their timing", add_help=False)
     commands.add_parser("status", help="what the running service says of itself", add_help=False)
+    commands.add_parser("record", help="begin or end a recording of the running service", add_help=False)
     commands.add_parser("doctor", help="say what is missing before a flight, and what to do", add_help=False)
     commands.add_parser("calibrate", help="make or judge a camera file with a board", add_help=False)
     commands.add_parser("web", help="the page with recordings: compare settings on them", add_help=False)
@@ -115,6 +116,12 @@ def _status_parser() -> argparse.ArgumentParser:
     return status_parser()
 
 
+def _record_parser() -> argparse.ArgumentParser:
+    from companion.recorder.command import record_parser
+
+    return record_parser()
+
+
 def _calibrate_parser() -> argparse.ArgumentParser:
     from companion.calibrate.command import calibrate_parser
 
@@ -134,6 +141,7 @@ _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
     "doctor": _doctor_parser,
     "calibrate": _calibrate_parser,
     "status": _status_parser,
+    "record": _record_parser,
     "web": _web_parser,
 }
 """Commands whose modules import much that nothing else needs."""

@@ -44,7 +44,7 @@ from companion.interception import Interception
 from companion.io.desk import ServiceDesk
 from companion.io.feed import Feed
 from companion.io.messages import Kind
-from companion.io.sinks import RECORDER, sinks_of
+from companion.io.sinks import RECORDER, sinks_of, wanted_from_the_start
 from companion.io.supervisor import IoSupervisor
 from companion.io.taps import LatchedClock, LogTap, TappedLink
 from companion.log import LevelGate, Log
@@ -126,6 +126,8 @@ class Service:
     ) -> None:
         self._is_listened_to = feed is not None or bool(sinks_of(config))
         self._feed = feed if feed is not None else Feed()
+        if feed is None:
+            self._feed.want(wanted_from_the_start(config))
         self._feed_status: Callable[[int], None] = lambda _: None
         self._feed_status_ns = 0
         self._desk: ServiceDesk | None = None
@@ -395,6 +397,7 @@ class Service:
                         failures = 0
                         vision.offer(frame, flight.pose_of(frame, now_ns))
                         self._feed.frame(frame, now_ns)
+                        del frame  # it may be the driver's memory: not kept while the next one is waited for
                 self._source_fault = "frame source has ended"
                 log.warning("source_ended")
                 if config.scheme == "file":

@@ -27,6 +27,7 @@ from companion.io.messages import (
     MAX_PACKET_BYTES,
     FromIo,
     Kind,
+    Message,
     Ready,
     Unusable,
     Wanted,
@@ -88,13 +89,20 @@ def _serve(connection: socket.socket) -> int:
         traceback.print_exc()
         return 1
     outbox.send(Ready())
-    receiver = Receiver()
+    receiver, lost_frames = Receiver(), 0
     try:
         while True:
             packet, fds, _, _ = socket.recv_fds(connection, MAX_PACKET_BYTES, 1)
             if not packet:
                 break
-            for message in receiver.messages(packet, fds):
+            messages = list(receiver.messages(packet, fds))
+            if receiver.lost_frames > lost_frames:
+                lost_frames = receiver.lost_frames
+                lost = {"name": "dropped", "by": "ring", "counts": {"frame": lost_frames}}
+                messages.append(
+                    Message(Kind.CONTROL, time.monotonic_ns(), messages[-1].seq if messages else 0, lost)
+                )
+            for message in messages:
                 if message.kind is Kind.ANSWER:
                     outbox.on_answer(message.fields)
                     continue

@@ -45,6 +45,7 @@ class Feed:
         self._retained: dict[tuple[Kind, str], _Item] = {}
         self._ring: FrameRing | None = None
         self._lost_frames = 0
+        self._told_dropped: dict[str, int] = {}
 
     # ------------------------------------------------------------------ who listens
 
@@ -169,6 +170,7 @@ class Feed:
         """Forget what waits and who listened: another process will say what it wants."""
         self._queues.clear()
         self._kinds = ALWAYS
+        self._told_dropped = {}
         for (kind, _), item in self._retained.items():
             if kind in ALWAYS:
                 self._queues.put(kind, item[2], item)
@@ -177,6 +179,9 @@ class Feed:
 
     def packets(self) -> Iterator[tuple[bytes, int | None]]:
         """Take what waits, as packets, each with a file descriptor that goes with it or None."""
+        if self.dropped != self._told_dropped:
+            self._told_dropped = self.dropped
+            self.control("dropped", {"by": "feed", "counts": self._told_dropped}, 0)
         packed: list[bytes] = []
         size = 0
         for item in self._queues.take_all():

@@ -123,6 +123,7 @@ class SinkThread:
         self._queues: KindQueues[Message] = KindQueues()
         self._wake = threading.Event()
         self._is_ending = False
+        self._has_started = False
         self._thread: threading.Thread | None = None
 
     # ------------------------------------------------------------------ for the sink
@@ -156,8 +157,8 @@ class SinkThread:
         self._thread.start()
 
     def put(self, message: Message) -> None:
-        """Queue a message that the sink wants. Never blocks."""
-        if message.kind in self.wants.kinds or message.kind in ALWAYS:
+        """Queue a message that the sink wants, or may want: what came before it has started is judged then. Never blocks."""
+        if not self._has_started or self._is_wanted(message):
             self._queues.put(message.kind, message.seq, message)
             self._wake.set()
 
@@ -173,15 +174,20 @@ class SinkThread:
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
+    def _is_wanted(self, message: Message) -> bool:
+        return message.kind in self.wants.kinds or message.kind in ALWAYS
+
     def _run(self, sink: Sink) -> None:
         try:
             sink.start()
+            self._has_started = True
             while True:
                 woken = self._wake.wait(_IDLE_S)
                 self._wake.clear()
                 is_ending = self._is_ending  # before what waits is taken: nothing is put after it
                 for message in self._queues.take_all():
-                    sink.take(message)
+                    if self._is_wanted(message):
+                        sink.take(message)
                 if is_ending:
                     break
                 if not woken:

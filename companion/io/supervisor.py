@@ -146,7 +146,8 @@ class IoSupervisor:
 
     async def _live(self, life: _Life, starter: ThreadPoolExecutor) -> str:
         """Feed one process until it ends; return why."""
-        self._feed.restart()
+        if self._restarts:  # the first one is told from the beginning, where that is wanted
+            self._feed.restart()
         try:
             await life.start(starter, self._config, self._sinks)
         except OSError as error:

@@ -1,0 +1,1 @@
+"""The recorder: flights as MCAP files and tlogs, written in the I/O process."""

@@ -121,22 +121,20 @@ class CameraSource:
         mailbox = self._mailbox
         if mailbox is None:
             raise RuntimeError("the source is not open; use it in `async with`")
-        held: _Stamped | None = None
-        try:
-            while True:
-                try:
-                    newest = await asyncio.wait_for(mailbox.get(), min(1.0, self._limits.hung_s))
-                except TimeoutError:
-                    self._replace_a_hung_thread(mailbox)
-                    continue
-                if held is not None:
-                    held.captured.give_back()
-                held = newest
-                self.counts.delivered += 1
-                yield Frame(held.captured.image, held.time_ns, held.seq, held.time_of)
-        finally:
-            if held is not None:
-                held.captured.give_back()
+        while True:
+            try:
+                newest = await asyncio.wait_for(mailbox.get(), min(1.0, self._limits.hung_s))
+            except TimeoutError:
+                self._replace_a_hung_thread(mailbox)
+                continue
+            self.counts.delivered += 1
+            try:
+                yield Frame(newest.captured.image, newest.time_ns, newest.seq, newest.time_of)
+            finally:
+                newest.captured.give_back()
+                # Not kept while the next one is waited for, which may take for ever: a driver whose memory is still
+                # mapped cannot be removed, and a camera that is plugged in again gets another name.
+                del newest
 
     def _started(self, mailbox: NewestMailbox[_Stamped], first_seq: int = 0) -> _CaptureThread:
         thread = _CaptureThread(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import threading
 import time
+import weakref
 from dataclasses import dataclass, field
 
 import cv2
@@ -91,6 +92,10 @@ class FakeKernel:
             Node(path, tuple(link for link, to in self.links.items() if to == path)) for path in self.cameras
         )
 
+    def mapped(self) -> int:
+        """Return how many buffers somebody has mapped: as long as there is one, no driver can be removed."""
+        return sum(memory() is not None for node in self.opened for memory in node.mapped)
+
     def open(self, path: str) -> FakeNode:
         path = self.links.get(path, path)
         camera = self.cameras.get(path)
@@ -109,6 +114,7 @@ class FakeNode:
         self.size_px = next(iter(sizes))
         self.rate_hz = 30.0
         self.memory: list[NDArray[np.uint8]] = []
+        self.mapped: list[weakref.ref[NDArray[np.uint8]]] = []
         self.queued: list[int] = []
         self.streaming = False
         self.closed = threading.Event()
@@ -146,7 +152,9 @@ class FakeNode:
     def map(self, length: int, offset: int) -> NDArray[np.uint8]:
         memory = self.memory[offset // 4096]
         assert length == memory.size
-        return memory
+        mapped = np.frombuffer(memory.data, np.uint8)
+        self.mapped.append(weakref.ref(mapped))
+        return mapped
 
     def wait(self, timeout_s: float) -> bool:
         until_s = time.monotonic() + timeout_s

@@ -91,7 +91,10 @@ def test_an_interrupted_suite_leaves_nothing_behind_and_says_how_to_go_on(tmp_pa
         assert process.poll() is None
         pause.wait(0.05)
     process.send_signal(number)
-    output, _ = process.communicate(timeout=30)
+    try:
+        output, _ = process.communicate(timeout=90)
+    finally:
+        process.kill()
     assert process.returncode == 130
     assert b"of 18 flights are flown; the same command flies the others" in b" ".join(output.split())
     assert processes_with(str(places)) == set()

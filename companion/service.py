@@ -398,7 +398,6 @@ class Service:
                         vision.offer(frame, flight.pose_of(frame, now_ns))
                         self._feed.frame(frame, now_ns)
                         del frame  # it may be the driver's memory: not kept while the next one is waited for
-                        del frame  # it may be the driver's memory: not kept while the next one is waited for
                 self._source_fault = "frame source has ended"
                 log.warning("source_ended")
                 if config.scheme == "file":

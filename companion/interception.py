@@ -14,7 +14,10 @@ from companion.guidance.geodesy import Anchor, GlobalReference
 from companion.guidance.observation import DetectionReport, Pose
 from companion.guidance.pose_buffer import PoseBuffer
 from companion.guidance.setpoint import (
+    Decision,
     Drop,
+    Forward,
+    Rewrite,
     Setpoint,
     Unprotected,
     Verdict,
@@ -112,6 +115,7 @@ class Interception:
         self._report_waiting: DetectionReport | None = None
         self._last_report: DetectionReport | None = None
         self._last_verdict: dict[str, Any] = {}
+        self._last_places: dict[str, tuple[float, float] | None] = {}
 
     # ------------------------------------------------------------------ from the proxy
 
@@ -141,7 +145,7 @@ class Interception:
         self._last_verdict = verdict_fields(setpoint, verdict)
         if self.feed.wants(Kind.SETPOINT):
             fields = {"planner": f"{system_id}/{component_id}", "state": str(self.switch.state)}
-            self.feed.setpoint({**fields, **self._last_verdict}, now_ns)
+            self.feed.setpoint({**fields, **self._last_places, **self._last_verdict}, now_ns)
         if self._config.log.setpoints:
             self._log.info(
                 "setpoint",
@@ -158,6 +162,7 @@ class Interception:
             setpoint, reading, pose=self.switch.pose, anchor=anchor, autopilot=autopilot, config=guidance
         )
         decision = self.switch.on_setpoint(wish, now_ns)
+        self._last_places = {"goal_ned": wish.goal, "decided_ned": _place_of(decision, wish.goal)}
         return express(
             decision,
             setpoint,
@@ -469,3 +474,10 @@ class Interception:
 
 def _severity(event: StateChanged) -> MavSeverity:
     return MavSeverity.WARNING if event.state is State.HOLD else MavSeverity.INFO
+
+
+def _place_of(decision: Decision, goal: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return north and east (m, local NED) of where a decision sends the vehicle; None where it says no place."""
+    if isinstance(decision, Rewrite):
+        return decision.x, decision.y
+    return goal if isinstance(decision, Forward) else None

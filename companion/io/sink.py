@@ -36,7 +36,8 @@ kind         fields
 FRAME        ``seq``, ``time_of``, ``height_px``, ``width_px``, ``taken_ns``; ``message.image`` is (H, W) uint8,
              ``time_ns`` the exposure
 POSE         ``north_m``, ``east_m``, ``down_m``, ``q_ned_from_body`` (w, x, y, z), ``speed_m_s``
-SETPOINT     ``planner`` ("system/component"), ``state``, and ``companion.log_fields.verdict_fields``: ``planned``,
+SETPOINT     ``planner`` ("system/component"), ``state``, ``goal_ned`` and ``decided_ned`` (north and east in local NED of what
+             was asked for and of what the switch S made of it; null where there is none), and ``companion.log_fields.verdict_fields``: ``planned``,
              ``action`` (forwarded, substituted, held, turned, dropped, unprotected), ``sent``, ``yaw_deg``
 DETECTION    the fields of ``guidance.observation.DetectionReport``; ``time_ns`` is when it came
 DETAILS      ``frame_seq``, ``frame_ns``, ``method``, and ``message.arrays()`` as ``companion.vision.details`` lists them

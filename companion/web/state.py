@@ -16,6 +16,8 @@ KEPT: Final[Mapping[str, int]] = {"log": 200, "states": 300, "series": 600, "tra
 """What is kept of each list, here and for each viewer: the newest."""
 
 _TRAIL_STEP_M: Final = 0.05
+_AT_THE_GOAL_M: Final = 0.2
+"""Nearer than this a goal has no direction worth drawing."""
 _SHOWN_STATUS: Final = (
     "state",
     "reason",
@@ -82,6 +84,7 @@ class LiveState:
         self._lists: dict[str, deque[Any]] = {name: deque(maxlen=kept) for name, kept in KEPT.items()}
         self._new = Increment()
         self._size_px: tuple[int, int] | None = None
+        self._pose: Mapping[str, Any] | None = None
         self._links: dict[str, dict[str, Any]] = {}
         self._confidence: float | None = None
         self._attitude: tuple[int, list[float] | None] = (-1, None)
@@ -101,7 +104,7 @@ class LiveState:
             case Kind.POSE:
                 self._take_pose(fields, time_s)
             case Kind.SETPOINT:
-                self._set("setpoint", {"t": time_s, **_only(fields, _DRAWN_SETPOINT)})
+                self._set("setpoint", self._setpoint_view(fields, time_s))
             case Kind.DETECTION:
                 self._confidence = fields.get("confidence")
                 if (pose := fields.get("pose")) is not None:
@@ -146,6 +149,7 @@ class LiveState:
     def _take_pose(self, fields: Mapping[str, Any], time_s: float) -> None:
         q = fields["q_ned_from_body"]
         north_m, east_m = float(fields["north_m"]), float(fields["east_m"])
+        self._pose = fields
         self._set(
             "pose",
             {
@@ -158,6 +162,21 @@ class LiveState:
         trail = self._lists["trail"]
         if not trail or math.hypot(trail[-1][0] - north_m, trail[-1][1] - east_m) >= _TRAIL_STEP_M:
             self._append("trail", [round(north_m, 2), round(east_m, 2)])
+
+    def _setpoint_view(self, fields: Mapping[str, Any], time_s: float) -> dict[str, Any]:
+        """Return a setpoint with where the planner's goal lies in the picture (``goal_px``), where it does."""
+        view: dict[str, Any] = {"t": time_s, **_only(fields, _DRAWN_SETPOINT)}
+        goal, pose = fields.get("goal_ned"), self._pose
+        if goal is None or pose is None or self._size_px is None:
+            return view
+        north_m, east_m = goal[0] - pose["north_m"], goal[1] - pose["east_m"]
+        if math.hypot(north_m, east_m) < _AT_THE_GOAL_M:
+            return view
+        azimuth_rad = math.atan2(east_m, north_m)
+        (point,) = self._projection.points_px([azimuth_rad], pose["q_ned_from_body"], self._size_px)
+        if point is not None:
+            view["goal_px"] = point
+        return view
 
     def _take_status(self, fields: Mapping[str, Any], time_s: float) -> None:
         self._set("status", {"t": time_s, **_only(fields, _SHOWN_STATUS)})

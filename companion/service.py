@@ -30,10 +30,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from companion.addressed import AddressedSetpoints
 from companion.clock import Clock
 from companion.config import Config
 from companion.config_sources import ConfigPlaces
+from companion.core import Core
 from companion.errors import SourceError
 from companion.frames.camera import CameraSource
 from companion.frames.file import FileSource
@@ -51,9 +51,8 @@ from companion.log import LevelGate, Log
 from companion.mavlink.endpoint import Endpoint, Link
 from companion.mavlink.endpoints import make_side
 from companion.mavlink.identity import Identity
-from companion.mavlink.network import Side
-from companion.mavlink.proxy import InlineProxy, OwnComponent
-from companion.mavlink.signing import Signatures, open_signatures
+from companion.mavlink.proxy import InlineProxy
+from companion.mavlink.signing import open_signatures
 from companion.own import Own
 from companion.reload import Reload
 from companion.status.http import MetricsServer
@@ -62,7 +61,6 @@ from companion.status.server import Command, StatusServer
 from companion.status.snapshot import Section, Snapshots
 from companion.status.unix_socket import socket_path
 from companion.systemd import ServiceNotifier
-from companion.takeover import TakeoverFlight
 from companion.vision.supervisor import VisionSupervisor
 
 _HEALTH_PERIOD_NS: Final = 100_000_000
@@ -187,35 +185,20 @@ class Service:
             self._links = (*planner, *autopilot)
             signatures = open_signatures(config.link)
             planner_links, autopilot_links, now_ns = self._tapped(planner, autopilot)
-            identity = Identity(
-                Side(planner_links),
-                Side(autopilot_links),
-                component_id=config.link.component_id,
-                now_ns=now_ns,
-                signatures=signatures,
-            )
-            flight = Interception(config, identity=identity, log=log, feed=self._feed)
             began_ns = clock.now_ns()
             self._feed.config(config, began_ns)
-            own = Own(
+            core = Core.build(
                 config,
-                flight,
-                identity,
-                log=log,
-                now_ns=began_ns,
-                apply=self._apply,
-                signatures=signatures,
-            )
-            takeover, tap = _way_of_interception(config, flight, identity, own, log, signatures)
-            proxy = InlineProxy(
                 planner_links,
                 autopilot_links,
-                flight,
                 now_ns=now_ns,
+                began_ns=began_ns,
                 signatures=signatures,
-                own=tap,
-                filters=config.link.filter_rules,
+                apply=self._apply,
+                feed=self._feed,
+                log=log,
             )
+            identity, flight, own, proxy = core.identity, core.flight, core.own, core.proxy
 
             def on_report(report: DetectionReport) -> None:
                 self._take_report(flight, report)
@@ -254,8 +237,8 @@ class Service:
             loops.update(self._status_loops(flight, own, proxy, vision))
             loops.update(self._io_loops(identity))
             self._feed_status = partial(self._tell_feed, flight, vision, proxy, own)
-            if takeover is not None:
-                loops["takeover"] = takeover.run(clock)
+            if core.takeover is not None:
+                loops["takeover"] = core.takeover.run(clock)
             if self._notifier.enabled:
                 loops["systemd"] = self._tell_systemd(flight)
             log.info(
@@ -508,32 +491,6 @@ class Service:
             await self._clock.sleep_until_ns(self._clock.now_ns() + int(interval_s * 1e9))
             now_ns = self._clock.now_ns()
             self._log.info("status", **self._status_fields(flight, vision, proxy, own, now_ns))
-
-
-def _way_of_interception(
-    config: Config,
-    flight: Interception,
-    identity: Identity,
-    own: Own,
-    log: Log,
-    signatures: Signatures | None,
-) -> tuple[TakeoverFlight | None, OwnComponent]:
-    """Return what flies in place of the mission, where that is configured, and what the proxy offers frames to."""
-    match config.interception.mode:
-        case "takeover":
-            takeover = TakeoverFlight(
-                config,
-                flight,
-                identity,
-                log=log,
-                own=own.component,
-                engaged=lambda: own.engagement.engaged,
-            )
-            return takeover, takeover
-        case "addressed":
-            return None, AddressedSetpoints(flight, identity, own=own.component, signatures=signatures)
-        case "inline":
-            return None, own.component
 
 
 def _labels(links: Sequence[Endpoint]) -> str:

@@ -19,6 +19,7 @@ from companion.clock import Clock
 from companion.config import Config
 from companion.errors import CompanionError, ConfigError, first_of
 from companion.frames.source import FrameSource
+from companion.io.feed import Feed
 from companion.log import Log
 from companion.mavlink.endpoint import Endpoint
 from companion.service import Service
@@ -38,6 +39,8 @@ class CompanionTask:
         Makes the frame source.
     on_event
         Called with every event of its log, as it comes.
+    feed
+        Told what happens in it.
 
     Raises
     ------
@@ -52,6 +55,7 @@ class CompanionTask:
         clock: Clock,
         open_frames: Callable[[], FrameSource],
         on_event: Callable[[Event], None] | None = None,
+        feed: Feed | None = None,
     ) -> None:
         links = {"planner": "udpin:127.0.0.1:0", "autopilot": "udpin:127.0.0.1:0"}
         merged = {**tables, "link": {**links, **tables.get("link", {})}}
@@ -64,7 +68,11 @@ class CompanionTask:
         self._on_event = on_event
         self._news = asyncio.Event()
         self._service = Service(
-            config, clock=clock, log=_event_log(config.log.level, self._take), open_frames=open_frames
+            config,
+            clock=clock,
+            log=_event_log(config.log.level, self._take),
+            open_frames=open_frames,
+            feed=feed,
         )
         self._task: asyncio.Task[None] | None = None
 

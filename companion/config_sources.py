@@ -28,6 +28,7 @@ from companion.errors import ConfigError
 
 ENVIRONMENT_PREFIX: Final = "VOID_COMPANION_"
 DEFAULT_NAME: Final = "default"
+FOLLOWS_NAME: Final = "follows from what is set"
 _PATH_KEYS: Final = (
     "camera.file",
     "detector.params_file",
@@ -127,9 +128,17 @@ class LoadedConfig:
     layers: tuple[Layer, ...]
 
     def origin(self, key: str) -> str:
-        """Return where the value of a dotted key comes from; `DEFAULT_NAME` where nobody has set it."""
+        """Return where the value of a dotted key comes from.
+
+        Where nobody has set it: `DEFAULT_NAME`, or `FOLLOWS_NAME` of one that depends on what else is set, such as where
+        a ground station's settings are kept.
+        """
         layer = _setter(self.layers, key)
-        return DEFAULT_NAME if layer is None else layer.name
+        if layer is not None:
+            return layer.name
+        section, _, name = key.partition(".")
+        is_default = getattr(getattr(self.config, section), name) == getattr(getattr(Config(), section), name)
+        return DEFAULT_NAME if is_default else FOLLOWS_NAME
 
 
 def load_config(path: str | Path) -> Config:

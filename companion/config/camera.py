@@ -17,7 +17,7 @@ class CameraConfig(Section):
         Field(
             gt=5,
             lt=170,
-            description="Horizontal field of view, used when no calibration file is given (deg).",
+            description="Horizontal field of view, used when no calibration file is given. Larger than it is: directions too far to the side; smaller: too near to the middle (deg).",
         ),
     ] = 70.0
     file: Annotated[
@@ -25,11 +25,20 @@ class CameraConfig(Section):
     ] = ""
     mount_roll_deg: Annotated[
         float,
-        Field(ge=-180, le=180, description="Rotation of the camera about the body's forward axis (deg)."),
+        Field(
+            ge=-180,
+            le=180,
+            description="Rotation of the camera about the body's forward axis; larger: further clockwise as seen from behind (deg).",
+        ),
     ] = 0.0
     mount_pitch_deg: Annotated[
-        float, Field(ge=-90, le=90, description="Camera tilt; positive looks up (deg).")
+        float, Field(ge=-90, le=90, description="Camera tilt; positive looks up, larger: further up (deg).")
     ] = 0.0
     mount_yaw_deg: Annotated[
-        float, Field(ge=-180, le=180, description="Camera pan; positive looks to the right (deg).")
+        float,
+        Field(
+            ge=-180,
+            le=180,
+            description="Camera pan; positive looks to the right, larger: further to the right (deg).",
+        ),
     ] = 0.0

@@ -33,18 +33,32 @@ class DetectorConfig(Section):
         Field(
             gt=0,
             le=60,
-            description="A pair that takes longer counts as hung: the worker is killed and restarted.",
+            description="A pair that takes longer counts as hung: the worker is killed and restarted. Larger: a hang is noticed later; smaller: a slow answer costs a worker (s).",
         ),
     ] = 10.0
     start_timeout_s: Annotated[
-        float, Field(gt=0, le=300, description="Time allowed for the worker to start (imports included).")
+        float,
+        Field(
+            gt=0,
+            le=300,
+            description="Time allowed for the worker to start (imports included). Larger: one that hangs at its start is noticed later (s).",
+        ),
     ] = 60.0
     restart_delay_s: Annotated[
         float,
-        Field(gt=0, le=60, description="First delay before a restart; doubles up to restart_delay_max_s."),
+        Field(
+            gt=0,
+            le=60,
+            description="First delay before a restart; doubles up to restart_delay_max_s. Larger: back later after a single failure (s).",
+        ),
     ] = 0.2
     restart_delay_max_s: Annotated[
-        float, Field(gt=0, le=600, description="Longest delay between restarts.")
+        float,
+        Field(
+            gt=0,
+            le=600,
+            description="Longest delay between restarts. Larger: less load of a worker that keeps failing, back later (s).",
+        ),
     ] = 5.0
     vehicle_width_m: Annotated[
         float,
@@ -56,7 +70,11 @@ class DetectorConfig(Section):
     ] = 0.9
     vehicle_height_m: Annotated[
         float,
-        Field(gt=0, le=5, description="Height swept likewise, margins included (m)."),
+        Field(
+            gt=0,
+            le=5,
+            description="Height swept likewise, margins included. Larger: more counts as being in the way (m).",
+        ),
     ] = 0.6
     baseline_m: Annotated[
         float,
@@ -75,7 +93,9 @@ class DetectorConfig(Section):
     threads: Annotated[
         int,
         Field(
-            ge=1, le=64, description="OpenCV and BLAS threads of the worker. Leave one core to the service."
+            ge=1,
+            le=64,
+            description="OpenCV and BLAS threads of the worker. Larger: answers sooner, less of the processor for the rest; leave one core to the service.",
         ),
     ] = 1
 

@@ -37,7 +37,7 @@ class GroundStationConfig(Section):
         Field(
             ge=0,
             le=60,
-            description="ONBOARD_COMPUTER_STATUS (load, memory, temperature) every so often; 0: never (s).",
+            description="ONBOARD_COMPUTER_STATUS (load, memory, temperature) every so often; 0: never. Larger: less on the link, older on the screen (s).",
         ),
     ] = 5.0
     timesync_rate_hz: Annotated[
@@ -45,6 +45,6 @@ class GroundStationConfig(Section):
         Field(
             ge=0,
             le=10,
-            description="How often the autopilot is asked for its clock (TIMESYNC); 0: never, poses are then late by the link's least delay (Hz).",
+            description="How often the autopilot is asked for its clock (TIMESYNC); 0: never, poses are then late by the link's least delay. Larger: a clock that drifts is followed sooner, more on the link (Hz).",
         ),
     ] = 1.0

@@ -45,7 +45,11 @@ class GuidanceConfig(Section):
     ] = 0.0
     step_margin_m: Annotated[
         float,
-        Field(ge=0, le=5, description="Kept between the end of a step and the nearest thing seen there (m)."),
+        Field(
+            ge=0,
+            le=5,
+            description="Kept between the end of a step and the nearest thing seen there. Larger: stops further from walls; too large: passes no door (m).",
+        ),
     ] = 0.8
     agree_deg: Annotated[
         float,
@@ -56,14 +60,19 @@ class GuidanceConfig(Section):
         ),
     ] = 12.0
     agree_hysteresis_deg: Annotated[
-        float, Field(ge=0, le=45, description="Extra angle before agreement is lost again (deg).")
+        float,
+        Field(
+            ge=0,
+            le=45,
+            description="Extra angle before agreement is lost again. Larger: changes less often between following the planner and steering (deg).",
+        ),
     ] = 5.0
     view_deg: Annotated[
         float,
         Field(
             gt=0,
             le=90,
-            description="Half angle about the camera's axis within which a bearing counts as in view (deg).",
+            description="Half angle about the camera's axis within which a bearing counts as in view. Larger: flies further to the side of where it looks (deg).",
         ),
     ] = 25.0
     align_deg: Annotated[
@@ -71,7 +80,7 @@ class GuidanceConfig(Section):
         Field(
             gt=0,
             le=90,
-            description="No translation while the commanded direction is further than this off the heading (deg).",
+            description="No translation while the commanded direction is further than this off the heading. Larger: begins to fly while still turning (deg).",
         ),
     ] = 20.0
     yaw_rate_deg_s: Annotated[
@@ -79,29 +88,47 @@ class GuidanceConfig(Section):
         Field(
             gt=0,
             le=180,
-            description="Cap of the commanded yaw's rate (deg/s). Autopilots do not all cap it themselves.",
+            description="Cap of the commanded yaw's rate; autopilots do not all cap it themselves. Larger: turns sooner, with more blurred pictures (deg/s).",
         ),
     ] = 30.0
     commit_distance_m: Annotated[
         float,
         Field(
-            gt=0, le=20, description="Distance flown along a void before looking towards the goal again (m)."
+            gt=0,
+            le=20,
+            description="Distance flown along a void before looking towards the goal again. Larger: wider detours, fewer turns (m).",
         ),
     ] = 1.5
     wall_k: Annotated[
         int,
         Field(
-            ge=1, le=20, description="Single-plane answers needed among the last wall_n to call it a wall."
+            ge=1,
+            le=20,
+            description="Single-plane answers needed among the last wall_n to call it a wall. Larger: fewer turns for a doubtful wall, and later ones for a real one.",
         ),
     ] = 2
-    wall_n: Annotated[int, Field(ge=1, le=20, description="Window of answers that wall_k counts in.")] = 3
+    wall_n: Annotated[
+        int,
+        Field(
+            ge=1,
+            le=20,
+            description="Window of answers that wall_k counts in. Larger: older answers count too, walls are called more often.",
+        ),
+    ] = 3
     wall_limit_m: Annotated[
-        float, Field(gt=0, le=50, description="A plane further away than this is not a wall yet (m).")
+        float,
+        Field(
+            gt=0,
+            le=50,
+            description="A plane further away than this is not a wall yet. Larger: turns earlier (m).",
+        ),
     ] = 2.0
     wall_margin_m: Annotated[
         float,
         Field(
-            ge=0, le=10, description="Added to min(goal, wall_limit_m) when a plane's range is judged (m)."
+            ge=0,
+            le=10,
+            description="Added to min(goal, wall_limit_m) when a plane's range is judged. Larger: turns earlier (m).",
         ),
     ] = 0.5
     turn_step_deg: Annotated[
@@ -109,7 +136,7 @@ class GuidanceConfig(Section):
         Field(
             gt=0,
             le=90,
-            description="Yaw step of a turn in front of a wall (deg). At most half the field of view.",
+            description="Yaw step of a turn in front of a wall; at most half the field of view. Larger: a way out is found in fewer looks, a narrow one may lie between two (deg).",
         ),
     ] = 30.0
     probe_step_m: Annotated[
@@ -117,7 +144,7 @@ class GuidanceConfig(Section):
         Field(
             gt=0,
             le=2,
-            description="Step flown to get parallax after a turn (m). Must exceed the detector's baseline.",
+            description="Step flown to get parallax after a turn; must exceed the detector's baseline. Larger: a surer answer, and further flown without one (m).",
         ),
     ] = 0.4
     bootstrap_probe: Annotated[
@@ -129,46 +156,81 @@ class GuidanceConfig(Section):
     hold_probe_s: Annotated[
         float,
         Field(
-            gt=0, le=60, description="HOLD without parallax for this long, planner wants to move: PROBE (s)."
+            gt=0,
+            le=60,
+            description="HOLD without parallax for this long, planner wants to move: PROBE. Larger: waits longer before it moves to see (s).",
         ),
     ] = 1.0
     arrive_radius_m: Annotated[
         float,
-        Field(ge=0, le=10, description="A goal nearer than this, stationary, is flown to directly (m)."),
+        Field(
+            ge=0,
+            le=10,
+            description="A goal nearer than this, stationary, is flown to directly. Larger: trusts the planner further from the goal (m).",
+        ),
     ] = 0.6
     goal_settle_s: Annotated[
-        float, Field(ge=0, le=60, description="A goal that has not moved for this long is stationary (s).")
+        float,
+        Field(
+            ge=0,
+            le=60,
+            description="A goal that has not moved for this long is stationary. Larger: arrives later; smaller: a slowly moving goal counts as reached (s).",
+        ),
     ] = 1.0
     episode_distance_m: Annotated[
         float,
         Field(
             gt=0,
             le=50,
-            description="An avoidance episode (side of turn, blocked bearings) ends after this distance (m).",
+            description="An avoidance episode (side of turn, blocked bearings) ends after this distance. Larger: keeps to the side it chose for longer (m).",
         ),
     ] = 3.0
     redetect_distance_m: Annotated[
-        float, Field(gt=0, le=10, description="An answer is used up after this distance from its frame (m).")
+        float,
+        Field(
+            gt=0,
+            le=10,
+            description="An answer is used up after this distance from its frame. Larger: flies further by what it saw before (m).",
+        ),
     ] = 1.0
     redetect_yaw_deg: Annotated[
         float,
-        Field(gt=0, le=180, description="An answer is used up after this much yaw from its frame (deg)."),
+        Field(
+            gt=0,
+            le=180,
+            description="An answer is used up after this much yaw from its frame. Larger: turns further by what it saw before (deg).",
+        ),
     ] = 25.0
     detection_max_age_s: Annotated[
-        float, Field(gt=0, le=60, description="Greatest age of an answer while moving (s).")
+        float,
+        Field(
+            gt=0,
+            le=60,
+            description="Greatest age of an answer while moving. Larger: fewer stops, flies longer by what it saw before (s).",
+        ),
     ] = 2.0
     detection_max_age_hover_s: Annotated[
-        float, Field(gt=0, le=600, description="Greatest age of an answer at rest (s).")
+        float,
+        Field(
+            gt=0,
+            le=600,
+            description="Greatest age of an answer at rest. Larger: probes less often; what has moved meanwhile is noticed later (s).",
+        ),
     ] = 10.0
     moving_m_s: Annotated[
-        float, Field(gt=0, le=5, description="Above this speed the vehicle counts as moving (m/s).")
+        float,
+        Field(
+            gt=0,
+            le=5,
+            description="Above this speed the vehicle counts as moving. Larger: the longer age at rest holds up to higher speeds (m/s).",
+        ),
     ] = 0.15
     bad_reports_to_hold: Annotated[
         int,
         Field(
             ge=1,
             le=20,
-            description="Reports without an answer in a row (too little texture, blurred, ...; not: no motion) that end the last answer.",
+            description="Reports without an answer in a row (too little texture, blurred, ...; not: no motion) that end the last answer. Larger: flies on through short gaps of sight.",
         ),
     ] = 2
     min_confidence: Annotated[
@@ -180,19 +242,36 @@ class GuidanceConfig(Section):
         ),
     ] = 0.3
     probe_timeout_s: Annotated[
-        float, Field(gt=0, le=60, description="A probe that brought no answer in this time has failed (s).")
+        float,
+        Field(
+            gt=0,
+            le=60,
+            description="A probe that brought no answer in this time has failed. Larger: waits longer for a slow detector (s).",
+        ),
     ] = 5.0
     report_timeout_s: Annotated[
         float,
         Field(
             gt=0,
             le=60,
-            description="No report of any kind from the worker for this long: vision counts as dead (s).",
+            description="No report of any kind from the worker for this long: vision counts as dead. Larger: noticed later; smaller: a slow detector counts as dead (s).",
         ),
     ] = 2.0
-    pose_max_age_s: Annotated[float, Field(gt=0, le=5, description="Greatest age of the pose (s).")] = 0.5
+    pose_max_age_s: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=5,
+            description="Greatest age of the pose. Larger: gaps of telemetry are flown through, by an older place (s).",
+        ),
+    ] = 0.5
     planner_timeout_s: Annotated[
-        float, Field(gt=0, le=60, description="Silence after which the planner's goal is forgotten (s).")
+        float,
+        Field(
+            gt=0,
+            le=60,
+            description="Silence after which the planner's goal is forgotten. Larger: an episode of avoidance outlives longer pauses (s).",
+        ),
     ] = 1.0
     estimator_jump_m: Annotated[
         float,
@@ -207,7 +286,7 @@ class GuidanceConfig(Section):
         Field(
             gt=0,
             le=3600,
-            description="HOLD for this long while the planner wants to move: give up, announced (s).",
+            description="HOLD for this long while the planner wants to move: give up, announced. Larger: tries for longer (s).",
         ),
     ] = 60.0
     give_up: Annotated[

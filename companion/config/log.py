@@ -22,7 +22,9 @@ class LogConfig(Section):
     status_interval_s: Annotated[
         float,
         Field(
-            ge=0, le=3600, description="A status line with all rates and ages every so often; 0: never (s)."
+            ge=0,
+            le=3600,
+            description="A status line with all rates and ages every so often; 0: never. Larger: a smaller log, fewer looks back (s).",
         ),
     ] = 10.0
     detections: Annotated[bool, Field(description="One line for each detection report.")] = False

@@ -71,7 +71,12 @@ class SourceConfig(Section):
         ),
     ] = 0
     height_px: Annotated[
-        int, Field(ge=0, le=8192, description="Cameras: height; goes with width_px (px).")
+        int,
+        Field(
+            ge=0,
+            le=8192,
+            description="Cameras: height; goes with width_px. Larger: slower, and hardly better (px).",
+        ),
     ] = 0
     rate_hz: Annotated[
         float,
@@ -94,7 +99,7 @@ class SourceConfig(Section):
         Field(
             ge=-200,
             le=2000,
-            description="Cameras and streams: how long before its time stamp a frame was exposed; subtracted. Needed where frames only have a time of arrival (ms).",
+            description="Cameras and streams: how long before its time stamp a frame was exposed; subtracted. Needed where frames only have a time of arrival. Larger: frames count as older; where it is wrong, directions are while turning (ms).",
         ),
     ] = 0.0
     playback: Annotated[
@@ -105,7 +110,12 @@ class SourceConfig(Section):
         Field(description="file: start again at the end. Otherwise the source ends and detection stops."),
     ] = False
     fps: Annotated[
-        float, Field(gt=0, le=1000, description="file: frame rate where the recording does not say (Hz).")
+        float,
+        Field(
+            gt=0,
+            le=1000,
+            description="file: frame rate where the recording does not say. Larger: played faster than it was recorded (Hz).",
+        ),
     ] = 10.0
     min_rate_hz: Annotated[
         float,
@@ -120,7 +130,7 @@ class SourceConfig(Section):
         Field(
             gt=0,
             le=60,
-            description="No new picture for this long (nothing, only damaged ones, or the same one again and again): the camera counts as dead and is opened again (s).",
+            description="No new picture for this long (nothing, only damaged ones, or the same one again and again): the camera counts as dead and is opened again. Larger: a dead camera is noticed later; smaller: a slow one is taken for dead (s).",
         ),
     ] = 1.0
 

@@ -147,3 +147,14 @@ def test_show_of_the_defaults_says_default_everywhere():
     lines = [line for line in shown_with_origins(load(ConfigPlaces())).splitlines() if " = " in line]
     assert lines
     assert all(line.endswith("# default") for line in lines)
+
+
+def test_what_follows_from_other_settings_is_not_called_a_default(tmp_path):
+    loaded = load(ConfigPlaces(places(tmp_path, levels=1).file, {}, ('detector.preset="paper"',)))
+    assert (loaded.config.detector.method, loaded.origin("detector.method")) == (
+        "paper",
+        "follows from what is set",
+    )
+    assert loaded.origin("ground_station.parameters_file") == "follows from what is set"
+    assert loaded.origin("detector.preset") == "-o detector.preset"
+    assert loaded.origin("detector.deadline_s") == "default"

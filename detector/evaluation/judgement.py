@@ -18,6 +18,10 @@ DEEP_SHARE: Final = 0.9
 """Of the greatest depth: a column as deep as this is a right answer; a flat optimum has many."""
 WALL_LIMIT_M: Final = 3.0
 """Where the best free distance lies below it, a wall is ahead, if nothing else says whether one is."""
+_WALL_LIMIT_BAND_M: Final = 0.3
+"""As near to the limit as this, "wall" and "free" are the same to a vehicle."""
+_NEARLY_STEPS: Final = 6
+"""Of half a degree, to either side."""
 _CHANCE_COLUMNS: Final = 180
 _MIN_FORWARD_M: Final = 0.01
 """With less motion along the axis there is no time to contact to compare with."""
@@ -72,10 +76,14 @@ class Verdict:
     right, in_box, error_width, error_deg, profile_ratio
         Of a direction: right by any rule; inside a box; its distance from the true point as a share of the width and as an angle;
         the depth of its column over that of the deepest one.
+    nearly_right
+        Whether it, or a direction within three degrees to its left or right, is right.
     chance
         Share of the columns that would be right, in the row where most of the truth lies: what guessing would reach.
     single_plane_truth, no_motion_truth
         What the scene is.
+    near_wall_limit
+        Whether it ends within 0.3 m of the wall limit.
     foe_px
         Distance of the estimated focus of expansion from the true one, in the earlier frame.
     contact_frames, contact_truth_frames, contact_source, contact_error
@@ -97,12 +105,14 @@ class Verdict:
     width_px: int
     has_direction_truth: bool
     right: bool | None
+    nearly_right: bool | None
     in_box: bool | None
     error_width: float | None
     error_deg: float | None
     profile_ratio: float | None
     chance: float | None
     single_plane_truth: bool | None
+    near_wall_limit: bool
     no_motion_truth: bool | None
     foe_px: float | None
     contact_frames: float | None
@@ -179,12 +189,14 @@ def judge(answer: Answer, pair: Pair, scene: Scene, seconds: float) -> Verdict:
         width_px=scene.image_size_px[0],
         has_direction_truth=has_direction_truth(scene.truth),
         right=None if point is None else is_right(point, scene),
+        nearly_right=None if point is None else is_nearly_right(point, scene),
         in_box=in_box,
         error_width=error_width,
         error_deg=error_deg,
         profile_ratio=ratio,
         chance=chance_right(scene),
         single_plane_truth=is_single_plane(scene.truth),
+        near_wall_limit=_near_wall_limit(scene.truth),
         no_motion_truth=scene.truth.no_motion,
         foe_px=_focus_error_px(answer, scene),
         contact_frames=answer.contact_frames,
@@ -248,6 +260,28 @@ def is_right(point: tuple[float, float], scene: Scene) -> bool | None:
     ratio = profile_ratio(truth, point[0], scene.image_size_px[0])
     deep = ratio is not None and ratio >= DEEP_SHARE  # a column whose depth is not known is not right
     return near or deep or bool(_in_boxes(point, truth))
+
+
+def is_nearly_right(point: tuple[float, float], scene: Scene) -> bool | None:
+    """Return whether a direction is right, or one within three degrees to its left or right is; None where the truth or the camera does not say."""
+    found = is_right(point, scene)
+    camera = scene.camera
+    if found is None or found or camera is None:
+        return found
+    at_rad = math.atan((point[0] - camera.cx_px) / camera.fx_px)
+    beside_px = [
+        camera.cx_px + camera.fx_px * math.tan(at_rad + math.radians(0.5 * step))
+        for step in range(-_NEARLY_STEPS, _NEARLY_STEPS + 1)
+    ]
+    return any(
+        is_right((x_px, point[1]), scene) for x_px in beside_px if 0.0 <= x_px <= scene.image_size_px[0] - 1
+    )
+
+
+def _near_wall_limit(truth: Truth) -> bool:
+    """Return whether the freest direction ends so near to the wall limit that neither answer is wrong."""
+    best_m = truth.best_free_distance_m
+    return best_m is not None and abs(best_m - WALL_LIMIT_M) <= _WALL_LIMIT_BAND_M
 
 
 def chance_right(scene: Scene) -> float | None:

@@ -280,6 +280,7 @@ def _direction(verdicts: Sequence[Verdict], seed: int) -> dict[str, Any]:
         "open_with_truth": len(open_),
         "open_right": sum(v.right is True for v in open_),
         "open_right_ci": _ci(open_, lambda v: v.right is True, seed),
+        "open_nearly_right": sum(v.nearly_right is True for v in open_),
         "pairs_with_truth": sum(v.has_direction_truth for v in verdicts),
     }
 
@@ -294,6 +295,9 @@ def _single_plane(verdicts: Sequence[Verdict], seed: int) -> dict[str, Any]:
     open_ = [v for v in verdicts if v.single_plane_truth is False]
     tp = sum(v.kind == SINGLE_PLANE for v in walls)
     fp = sum(v.kind == SINGLE_PLANE for v in open_)
+    clear = [
+        (v.kind == SINGLE_PLANE, v.single_plane_truth) for v in [*walls, *open_] if not v.near_wall_limit
+    ]
     return {
         "tp": tp,
         "fp": fp,
@@ -303,6 +307,10 @@ def _single_plane(verdicts: Sequence[Verdict], seed: int) -> dict[str, Any]:
         "silent_elsewhere": sum(v.kind == NONE for v in open_),
         "found_ci": _ci(walls, lambda v: v.kind == SINGLE_PLANE, seed),
         "false_ci": _ci(open_, lambda v: v.kind == SINGLE_PLANE, seed),
+        "clear_tp": sum(said and true for said, true in clear),
+        "clear_fp": sum(said and not true for said, true in clear),
+        "clear_fn": sum(not said and true for said, true in clear),
+        "clear_tn": sum(not said and not true for said, true in clear),
     }
 
 

@@ -57,6 +57,22 @@ def test_inside_either_box_is_right():
     assert verdict(at(100.0, 40.0), truth).error_width == pytest.approx(70 / 400)
 
 
+def test_beside_what_is_right_by_up_to_three_degrees_is_nearly_right():
+    truth = Truth(far_box=(195, 90, 205, 110))
+    beside_px = 205.0 + 300.0 * math.tan(math.radians(2.8))
+    beyond_px = 205.0 + 300.0 * math.tan(math.radians(3.3))
+    known = [verdict(at(x), truth, camera=CAMERA) for x in (200.0, beside_px, beyond_px)]
+    assert [(v.right, v.nearly_right) for v in known] == [(True, True), (False, True), (False, False)]
+    assert verdict(at(beside_px), truth).nearly_right is False  # without a camera a degree is nothing known
+    assert verdict(at(200.0)).nearly_right is None
+
+
+def test_a_way_that_ends_within_a_hand_of_the_wall_limit_is_marked():
+    ends_m = (None, 2.6, 2.8, 3.2, 3.4)
+    found = [verdict(at(200.0), Truth(best_free_distance_m=end_m)).near_wall_limit for end_m in ends_m]
+    assert found == [False, False, True, True, False]
+
+
 def test_a_column_at_nine_tenths_of_the_deepest_is_right():
     truth = profile(10.0, 9.0, 8.9, None, x=50.0)
     found = [verdict(at(x), truth) for x in (50.0, 150.0, 250.0, 350.0)]

@@ -16,6 +16,7 @@ back_off=/etc/systemd/system/$name.service.d/back-off.conf
 rules=/etc/udev/rules.d/70-$name.rules
 sysusers=/etc/sysusers.d/$name.conf
 command_link=/usr/local/bin/companion
+extras=web # small, and the live page is then switched on by the configuration alone
 back_off_since=254 # the first systemd with RestartSteps=
 
 fail() {
@@ -144,11 +145,11 @@ say "the program and what it needs"
 pip=("$prefix/bin/python" -m pip --quiet --disable-pip-version-check --no-cache-dir)
 if [ -n "$wheels" ]; then
     newest="$(find "$wheels" -name 'void_companion-*.whl' | sort -V | tail -n 1)"
-    "${pip[@]}" install --no-index --find-links "$wheels" "$newest"
+    "${pip[@]}" install --no-index --find-links "$wheels" "$newest[$extras]"
     # Same version, other build: pip would leave the old one.
     "${pip[@]}" install --no-index --no-deps --force-reinstall "$newest"
 else
-    "${pip[@]}" install "$here"
+    "${pip[@]}" install "$here[$extras]"
     "${pip[@]}" install --no-deps --force-reinstall "$here"
 fi
 "$prefix/bin/companion" --help >/dev/null

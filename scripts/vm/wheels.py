@@ -12,6 +12,8 @@ from vm.errors import VmError, run
 from vm.tools import NICE
 
 DEBIAN_12_PYTHON: Final = "3.11"
+EXTRAS: Final = "web"
+"""What `install.sh` installs besides: the live page is switched on by the configuration alone."""
 _GLIBC: Final = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_17", "manylinux2014")
 
 
@@ -51,7 +53,11 @@ def provide_wheels(
     options = ["--only-binary=:all:", "--implementation=cp", f"--python-version={python_version}"]
     options += [f"--platform={glibc}_{machine}" for glibc in _GLIBC]
     source = [f"--find-links={folder}", "-d", str(folder)]
-    run([*pip, "download", *options, *source, str(wheels[0])], log=log, what="the wheel's dependencies")
+    run(
+        [*pip, "download", *options, *source, f"{wheels[0]}[{EXTRAS}]"],
+        log=log,
+        what="the wheel's dependencies",
+    )
     return folder, wheels[0].name
 
 

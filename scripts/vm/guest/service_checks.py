@@ -7,11 +7,12 @@ import os
 import pwd
 import signal
 import time
+import urllib.request
 from pathlib import Path
 
 import vivid
-from programs import run
-from report import CheckFailedError, CheckSkippedError, check, require
+from programs import COMPANION, run
+from report import CheckFailedError, check, require
 
 _INSTALLER = Path(__file__).parent / "install" / "install.sh"
 _WHEELS = "/mnt/wheels"
@@ -36,6 +37,15 @@ start_timeout_s = 300.0
 deadline_s = 60.0
 [log]
 status_interval_s = 5.0
+[reload]
+watch_s = 0  # only when asked: so that it is known what a reload came from
+[recorder]
+start = "always"
+frames_hz = 2
+keep_free_mib = 100
+[web]
+enabled = true
+port = 8080
 """
 _DROP_IN = """\
 # The processor is emulated: a start takes half a minute here, and what shares the host can stop everything for seconds.
@@ -54,11 +64,13 @@ def before_reboot() -> bool:
     if not check("service: start, READY=1", _start):
         return False
     check("service: camera and worker within its confinement", _works)
-    check("service: status in systemctl", _status)
+    check("service: status in systemctl and at its socket", _status)
+    check("service: recorder and live page within its confinement", _io)
     check("service: camera unbound and bound again", _unplugged)
     check("service: watchdog ends a service that hangs", _watchdog)
     check("service: started again after a crash", _crash)
-    check("service: reload", _reload)
+    check("service: systemctl reload and SIGHUP", _reload)
+    check("service: reload of a broken file", _broken_reload)
     check("service: crash loop is never given up", _crash_loop)
     check("service: upgrade keeps configuration and runs on", _upgrade)
     return check("service: stop", _stop)
@@ -124,7 +136,23 @@ def _works() -> str:
 def _status() -> str:
     text = _shown("StatusText")
     require("frames" in text and ":" in text, f"StatusText is {text!r}")
+    answered = json.loads(run(COMPANION, "status", "--json", limit_s=120))
+    require(bool(answered), "companion status says nothing")
     return text
+
+
+def _io() -> str:
+    _wait_for_event("recording_started", _START_S)
+    recording = Path(str(_last_event("recording_started")["file"]))
+    require(recording.is_relative_to("/var/log/void-companion"), f"it records to {recording}")
+    begun_bytes = recording.stat().st_size
+    vivid.until(lambda: recording.stat().st_size > begun_bytes, 120.0, "more in the recording")
+    _wait_for_event("web_serving", _START_S)
+    with urllib.request.urlopen("http://127.0.0.1:8080/", timeout=120) as page:
+        require(page.status == 200, f"the page answers {page.status}")
+        page_bytes = len(page.read())
+    require(not _events("io_died"), f"the I/O process died: {_last_event('io_died')}")
+    return f"{recording} grows; the page answers with {page_bytes} bytes"
 
 
 def _unplugged() -> str:
@@ -156,14 +184,34 @@ def _crash() -> str:
 
 
 def _reload() -> str:
-    if _shown("CanReload") != "yes":
-        raise CheckSkippedError(
-            "the unit has no ExecReload: the service does not reload its configuration yet"
-        )
     pid = _pid()
-    run("systemctl", "reload", _UNIT, limit_s=120)
+    took_s = []
+    for asks, setpoints in (
+        (lambda: run("systemctl", "reload", _UNIT, limit_s=120), "true"),
+        (lambda: os.kill(pid, signal.SIGHUP), "false"),
+    ):
+        counted = len(_events("config_reloaded"))
+        _CONFIG.write_text(_SETTINGS.replace("[log]\n", f"[log]\nsetpoints = {setpoints}\n"))
+        asks()
+        took_s.append(
+            vivid.until(
+                lambda counted=counted: len(_events("config_reloaded")) > counted, 120.0, "config_reloaded"
+            )
+        )
+        changed = _last_event("config_reloaded")["changed"]
+        require(list(changed) == ["log.setpoints"], f"changed: {changed}")
     require(_pid() == pid, "the service was started anew")
-    return "same process"
+    return f"a changed setting taken after {took_s[0]:.1f} s and {took_s[1]:.1f} s, same process"
+
+
+def _broken_reload() -> str:
+    pid, counted = _pid(), len(_events("config_rejected"))
+    _CONFIG.write_text("this is no TOML\n")
+    run("systemctl", "reload", _UNIT, limit_s=120)
+    vivid.until(lambda: len(_events("config_rejected")) > counted, 120.0, "config_rejected")
+    _CONFIG.write_text(_SETTINGS)
+    require(_pid() == pid and _shown("ActiveState") == "active", "the service did not go on")
+    return f"refused ({_last_event('config_rejected')['error']}), the service goes on"
 
 
 def _crash_loop() -> str:

@@ -25,6 +25,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.sim.companion_process import toml_of
 from companion.status.client import StatusError, ask
+from companion.status.metrics import encoder
+from companion.status.show import status_text
 
 DEADLINE_S = 60.0
 SETPOINT = mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
@@ -263,6 +265,8 @@ async def jumping_clock(flight: Flight, jump: Path) -> None:
     """The wall clock jumps by an hour either way: no age, deadline or restart comes of it."""
     worker = await until_worker(flight)
     before = await flight.status()
+    assert "HOLD: " in status_text(before)  # what is shown and measured is made for what a real service says
+    assert b'void_companion_state{state="HOLD"} 1.0' in encoder()(before, "")[0]
     for seconds in ("3600", "-3600", "0"):
         write(jump, seconds.encode())
         await flight.goes_on()

@@ -76,7 +76,7 @@ class MotionEstimate:
     rotation_source
         ``attitude`` (given, not refined), ``attitude_refined`` or ``flow``.
     intrinsics_source
-        ``calibration``, ``field_of_view``, ``estimated`` or ``assumed``.
+        ``calibration``, ``field_of_view``, ``estimated`` (from the flow of earlier pairs) or ``assumed``.
     direction_later
         Unit vector from the earlier to the later position, in the later camera's axes.
     direction_sigma_deg, rotation_sigma_deg
@@ -89,6 +89,8 @@ class MotionEstimate:
         Whether one plane explains the flow better than a scene with depth, the share of samples that it explains, and its unit normal.
     parallax_rad
         Flow that the best rotation leaves, 80th percentile.
+    intrinsics_detail
+        How sure an estimate of the intrinsics is, or why there is none; else "".
     """
 
     rotation_source: str
@@ -104,6 +106,7 @@ class MotionEstimate:
     plane_share: float
     plane_normal_later: tuple[float, float, float] | None
     parallax_rad: float
+    intrinsics_detail: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,8 +98,8 @@ class ParallaxPipeline(VoidPipeline):
             confidence=reading.confidence,
             distance_m=distance_m,
             distance_spread_m=spread_m,
-            bearings=bearings_of(found, in_view, radius_m),
-            remembered=bearings_of(found, ~in_view, radius_m),
+            bearings=bearings_of(reading.surely, in_view, radius_m),
+            remembered=bearings_of(reading.surely, ~in_view, radius_m),
             obstacles=obstacles_seen(
                 near_points_m(reading.samples), np.eye(3), pose, self._vehicle.vehicle_height_m
             ),
@@ -128,14 +128,12 @@ def bearings_of(found: VoidMap, wanted: NDArray[np.bool_], radius_m: float) -> t
         if not (found.known[bins] & wanted[bins]).all():
             continue
         nearest = bins[int(np.argmin(found.free_m[bins]))]
-        spread_m = float(found.sigma_m[nearest])
-        if math.isfinite(spread_m):
+        distance_m, spread_m = float(found.free_m[nearest]) + radius_m, float(found.sigma_m[nearest])
+        # Known no better than to its own length, it is not known.
+        if spread_m < distance_m:
             told.append(
                 BearingRange(
-                    float(found.azimuth_rad[middle]),
-                    float(found.free_m[nearest]) + radius_m,
-                    spread_m,
-                    int(found.count[bins].max()),
+                    float(found.azimuth_rad[middle]), distance_m, spread_m, int(found.count[bins].max())
                 )
             )
     return tuple(told)

@@ -274,7 +274,7 @@ def _motion_rows(motion: MotionEstimate) -> list[tuple[str, str]]:
         focus = f"({motion.focus_px[0]:.0f}, {motion.focus_px[1]:.0f}) +- {motion.focus_sigma_px:.0f} px"
     plane = "one plane" if motion.plane_preferred else "a scene with depth"
     return [
-        ("camera", f"`{motion.intrinsics_source}`"),
+        ("camera", ": ".join(filter(None, (f"`{motion.intrinsics_source}`", motion.intrinsics_detail)))),
         ("rotation", f"`{motion.rotation_source}`, +- {motion.rotation_sigma_deg:.2f} degrees"),
         ("direction of travel", f"+- {motion.direction_sigma_deg:.1f} degrees"),
         ("focus of expansion", focus),

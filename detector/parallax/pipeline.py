@@ -42,10 +42,11 @@ _NO_TRACKS: Final = Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """A camera model and where it came from: ``calibration``, ``field_of_view``, ``estimated`` or ``assumed``."""
+    """A camera model and where it came from: ``calibration``, ``field_of_view``, ``estimated`` or ``assumed``; ``detail`` says more, for people."""
 
     camera: CameraModel
     source: str
+    detail: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +254,7 @@ class ParallaxDetector:
             camera, motion, plane, depths, samples, baseline_m, frame_from_later, is_level
         )
         clock.step("ranges")
-        estimate = _motion_estimate(geometry, intrinsics.source, field, left_rad)
+        estimate = _motion_estimate(geometry, intrinsics, field, left_rad)
         decision = decide(geometry, params, self.map_params)
         clock.step("map")
         diagnostics = replace(counts, focus_of_expansion_px=estimate.focus_px, motion=estimate)
@@ -301,14 +302,15 @@ def _unusable(earlier: Frame, later: Frame, camera: CameraModel) -> tuple[NoDete
 
 
 def _motion_estimate(
-    geometry: PairGeometry, intrinsics_source: str, field: FlowField, left_rad: float
+    geometry: PairGeometry, intrinsics: Intrinsics, field: FlowField, left_rad: float
 ) -> MotionEstimate:
     motion, plane = geometry.motion, geometry.plane
     focus = focus_of_expansion(motion, geometry.camera)
     normal = None if plane is None else plane.normal_later
     return MotionEstimate(
         rotation_source=motion.source.value,
-        intrinsics_source=intrinsics_source,
+        intrinsics_source=intrinsics.source,
+        intrinsics_detail=intrinsics.detail,
         direction_later=_floats(motion.direction_later),
         direction_sigma_deg=math.degrees(motion.direction_sigma_rad),
         rotation_sigma_deg=math.degrees(motion.rotation_sigma_rad),

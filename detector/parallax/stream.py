@@ -25,6 +25,8 @@ from detector.parallax.params import ParallaxParams
 from detector.parallax.pipeline import Intrinsics, PairGeometry, ParallaxDetector, ParallaxResult
 from detector.parallax.ranges import contact_about
 from detector.parallax.samples import RangedSamples
+from detector.parallax.sure_map import SureMap
+from detector.parallax.uncalibrated import UncalibratedCamera
 from detector.parallax.void_map import Gap, VoidMap, VoidMapParams, choose_gap
 from detector.params import DetectorParams
 from detector.pipeline import PairResult
@@ -47,6 +49,8 @@ class MapReading:
         The map of this pair alone.
     remembered
         What the last pairs say together, from this place.
+    surely
+        What may be flown: no further than it was looked through (:mod:`detector.parallax.sure_map`).
     gap
         The answer from it; None where it is another.
     confidence
@@ -56,6 +60,7 @@ class MapReading:
     samples: RangedSamples
     measured: VoidMap
     remembered: RememberedMap
+    surely: VoidMap
     gap: Gap | None
     confidence: float | None
 
@@ -75,7 +80,8 @@ class ParallaxObserver:
     params, map_params, memory_params
         Settings.
     camera, camera_source
-        Model of the camera, and where it came from: ``calibration`` or ``field_of_view``. Without it a field of view is assumed.
+        Model of the camera, and where it came from: ``calibration`` or ``field_of_view``. Without it the focal length is estimated from the flow of several pairs
+        (:mod:`detector.parallax.focal`); until that is sure enough a field of view is assumed, and the answer says which (``intrinsics_source``).
     observer_params
         How pairs are chosen.
     timer
@@ -97,9 +103,11 @@ class ParallaxObserver:
         self._map_params = map_params or VoidMapParams()
         self._params = params or ParallaxParams()
         self._memory = MapMemory(memory_params)
+        self._sure_map = SureMap(self._map_params, memory_params)
         self._pairs = _Pairs(
             ParallaxDetector(self._params, self._map_params, frame_params=frame_params, timer=timer),
             camera_source,
+            UncalibratedCamera(self._params),
         )
         self._observer = VoidObserver(
             frame_params,
@@ -114,6 +122,7 @@ class ParallaxObserver:
         """Forget all frames and maps."""
         self._observer.reset()
         self._memory.forget()
+        self._sure_map.forget()
         self._last_ns = None
 
     def between_frames(self) -> None:
@@ -152,8 +161,9 @@ class ParallaxObserver:
         measured, memory = decision.void_map, self._memory
         memory.add(measured, position_m, time_ns / 1e9)
         remembered = memory.remembered(position_m, time_ns / 1e9)
+        surely = self._sure_map.add(measured, geometry.samples, remembered.found, position_m, time_ns / 1e9)
         # The answer is a place in this picture; what is remembered beside it is for the way, not for the answer.
-        in_view = _limited(remembered.found, measured.known)
+        in_view = remembered.found.where(measured.known)
         diagnostics = result.detection.diagnostics
         decided = decide_on(geometry, in_view, 1.0, self._params, self._map_params)
         if decided.kind != GAP:
@@ -161,24 +171,29 @@ class ParallaxObserver:
             sure = None if found is None else confidence(remembered, found)
             detection = replace(decided, confidence=sure).answer(diagnostics)
             sure = None if isinstance(detection, NoDetection) else sure
-            return detection, MapReading(geometry.samples, measured, remembered, None, sure)
+            return detection, MapReading(geometry.samples, measured, remembered, surely, None, sure)
         gap = memory.answer(in_view, self._map_params)
         point = None if gap is None else _seen_at(geometry, gap.azimuth_rad)
         if gap is None or point is None:
-            return decided.answer(diagnostics), MapReading(geometry.samples, measured, remembered, None, None)
+            return decided.answer(diagnostics), MapReading(
+                geometry.samples, measured, remembered, surely, None, None
+            )
         ray, (x_px, y_px) = point
         sure = confidence(remembered, gap)
         contact = contact_about(geometry.depths, geometry.motion, ray, _CONTACT_GATE_RAD)
         detection = Direction(x_px, y_px, DirectionKind.GAP, contact, diagnostics, sure)
-        return detection, MapReading(geometry.samples, measured, remembered, gap, sure)
+        return detection, MapReading(geometry.samples, measured, remembered, surely, gap, sure)
 
 
 class _Pairs:
     """The parallax method as :class:`detector.observer.PairDetector`, keeping the last result for what the observer does not hand on."""
 
-    def __init__(self, detector: ParallaxDetector, camera_source: str) -> None:
+    def __init__(
+        self, detector: ParallaxDetector, camera_source: str, uncalibrated: UncalibratedCamera
+    ) -> None:
         self._detector = detector
         self._camera_source = camera_source
+        self._uncalibrated = uncalibrated
         self._pose: CameraPose | None = None
         self.result: ParallaxResult | None = None
 
@@ -200,27 +215,23 @@ class _Pairs:
         translation_earlier: NDArray[np.float64] | None = None,
     ) -> PairResult:
         """Return the answer to one pair."""
+        height_px, width_px = later.image.shape
+        intrinsics = (
+            self._uncalibrated.intrinsics(width_px, height_px)
+            if camera is None
+            else Intrinsics(camera, self._camera_source)
+        )
         self.result = self._detector.detect(
             earlier,
             later,
-            intrinsics=None if camera is None else Intrinsics(camera, self._camera_source),
+            intrinsics=intrinsics,
             later_from_earlier=later_from_earlier,
             translation_earlier_m=translation_earlier,
             level_from_later=None if self._pose is None else self._pose.world_from_camera,
         )
+        if camera is None and self.result.geometry is not None and self.result.field is not None:
+            self._uncalibrated.learn(self.result.field)
         return PairResult(self.result.detection, _NO_TRACKS, self.result.focus_px)
-
-
-def _limited(found: VoidMap, seen: NDArray[np.bool_]) -> VoidMap:
-    known = found.known & seen
-    return VoidMap(
-        found.azimuth_rad,
-        np.where(known, found.free_m, 0.0),
-        np.where(known, found.count, 0),
-        np.where(known, found.sigma_m, np.inf),
-        known,
-        found.metric,
-    )
 
 
 def _seen_at(

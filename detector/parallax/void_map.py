@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from detector.parallax.coverage import reach_in_rad
 from detector.parallax.samples import RangedSamples
 
 BINS: Final = 360
@@ -90,6 +91,22 @@ class VoidMapParams(BaseModel):
             description="Unknown gaps up to this width between known directions are bridged. Larger: bolder where there is little texture.",
         ),
     ] = 8.0
+    hidden_width_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=5,
+            description="A way is flown no further than to where something so wide could stand in it between the samples, unseen. Larger: bolder where there is little texture.",
+        ),
+    ] = 0.3
+    covered_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=20,
+            description="How far ahead that is asked (m); 0 asks it nowhere. Larger: shorter ways where there is little texture.",
+        ),
+    ] = 2.0
     plateau: Annotated[
         float,
         Field(
@@ -168,6 +185,18 @@ class VoidMap:
             metric,
         )
 
+    def where(self, keep: NDArray[np.bool_]) -> VoidMap:
+        """Return the map of the bins that a mask (M,) names; the others are unknown."""
+        known = self.known & keep
+        return VoidMap(
+            self.azimuth_rad,
+            np.where(known, self.free_m, 0.0),
+            np.where(known, self.count, 0),
+            np.where(known, self.sigma_m, np.inf),
+            known,
+            self.metric,
+        )
+
     def at(self, azimuth_rad: float) -> int:
         """Return the index of the bin of an azimuth."""
         return int(bin_of(np.array([azimuth_rad]))[0])
@@ -235,7 +264,8 @@ def void_map(samples: RangedSamples, params: VoidMapParams, *, baseline_m: float
     level = np.hypot(told.rays_level[:, 0], told.rays_level[:, 1])
 
     vouched, vouched_sigma, count = _vouched(azimuth, told, level, limit, params)
-    hit, hit_sigma = _first_hits(azimuth, told, level, radius, half_height, limit, params)
+    hidden, near = params.hidden_width_m / unit_m, params.covered_m / unit_m
+    hit, hit_sigma = _first_hits(azimuth, told, level, radius, half_height, limit, hidden, near, params)
     known = count >= params.known_samples
     # The disc's front touches before its middle is there, and so it is with what was only looked through.
     free = np.minimum(np.where(known, np.maximum(vouched - radius, 0.0), 0.0), hit)
@@ -359,6 +389,8 @@ def _first_hits(
     radius: float,
     half_height: float,
     limit: float,
+    hidden: float,
+    near: float,
     params: VoidMapParams,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how far the disc moves along each azimuth until it touches a surface, (M,), infinite where none; and the standard deviation."""
@@ -374,12 +406,15 @@ def _first_hits(
     sigma = told.sigma[inside] / told.inverse_range[inside] * away
     # Each sample stands in the way of the azimuths within its reach: one row for each of them.
     reach = np.arcsin(np.minimum(radius / np.maximum(away, radius), 1.0)) / _BIN_RAD
-    first = np.asarray(np.ceil(bearing / _BIN_RAD - reach), np.intp)
-    rows = np.maximum(np.asarray(np.floor(bearing / _BIN_RAD + reach), np.intp) - first + 1, 0)
+    left, right = reach_in_rad(told, bearing, away, hidden, near, math.radians(params.known_elevation_deg))
+    first = np.asarray(np.ceil((bearing - left) / _BIN_RAD - reach), np.intp)
+    rows = np.maximum(np.asarray(np.floor((bearing + right) / _BIN_RAD + reach), np.intp) - first + 1, 0)
     member = np.repeat(np.arange(inside.size), rows)
     within_rows = np.arange(member.size) - np.repeat(np.cumsum(rows) - rows, rows)
     bin_number = first[member] + within_rows
+    # Of what a surface may reach to on either side, the nearest to the way counts.
     off = bearing[member] - bin_number * _BIN_RAD
+    off = off - np.clip(off, -right[member], left[member])
     beside = away[member] * np.sin(off)
     distance = away[member] * np.cos(off) - np.sqrt(np.maximum(radius**2 - beside**2, 0.0))
     bin_number %= BINS

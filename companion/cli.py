@@ -80,6 +80,9 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("cameras", help="list cameras, take a picture, measure their timing", add_help=False)
     commands.add_parser("status", help="what the running service says of itself", add_help=False)
     commands.add_parser("record", help="begin or end a recording of the running service", add_help=False)
+    commands.add_parser(
+        "replay", help="a recording through the present code: what it decides otherwise", add_help=False
+    )
     commands.add_parser("doctor", help="say what is missing before a flight, and what to do", add_help=False)
     commands.add_parser("calibrate", help="make or judge a camera file with a board", add_help=False)
     commands.add_parser("web", help="the page with recordings: compare settings on them", add_help=False)
@@ -122,6 +125,12 @@ def _record_parser() -> argparse.ArgumentParser:
     return record_parser()
 
 
+def _replay_parser() -> argparse.ArgumentParser:
+    from companion.replay.command import replay_parser
+
+    return replay_parser()
+
+
 def _calibrate_parser() -> argparse.ArgumentParser:
     from companion.calibrate.command import calibrate_parser
 
@@ -142,6 +151,7 @@ _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
     "calibrate": _calibrate_parser,
     "status": _status_parser,
     "record": _record_parser,
+    "replay": _replay_parser,
     "web": _web_parser,
 }
 """Commands whose modules import much that nothing else needs."""

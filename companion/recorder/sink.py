@@ -62,6 +62,8 @@ class Recorder:
         Where recordings go; None: where the configuration says.
     monotonic_s
         Time for what is due by time.
+    wall_offset_ns
+        Wall time less the service's monotonic time; None: as this machine's clocks say when a file begins.
     """
 
     def __init__(
@@ -71,12 +73,14 @@ class Recorder:
         *,
         folder: Path | None = None,
         monotonic_s: Callable[[], float] = time.monotonic,
+        wall_offset_ns: int | None = None,
     ) -> None:
         self._config = config.recorder
         self._wants = wants_of(config)
         self._desk = desk
         self._folder = folder if folder is not None else folder_of(config, os.environ)
         self._monotonic_s = monotonic_s
+        self._wall_offset_ns = wall_offset_ns
         self._limits = Limits(
             round(self._config.file_mib * MIB),
             round(self._config.total_mib * MIB),
@@ -172,7 +176,9 @@ class Recorder:
         if why_not is not None:
             raise OSError(0, why_not)
         self._files += 1
-        offset_ns = time.time_ns() - time.monotonic_ns()
+        offset_ns = self._wall_offset_ns
+        if offset_ns is None:
+            offset_ns = time.time_ns() - time.monotonic_ns()
         about = {
             "version": version("void-companion"),
             "begun_by": self._begun_by,

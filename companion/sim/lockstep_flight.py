@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from contextlib import AsyncExitStack
 
+from companion.recorder.in_process import InProcessRecorder
 from companion.run_statistics import percentiles
 from companion.sim.companion_process import Event
 from companion.sim.companion_task import CompanionTask
@@ -30,18 +31,27 @@ _WORKER_START_S = 1.0
 """Simulated: it starts in no time."""
 
 
-def fly_in_lockstep(spec: FlightSpec, place: Place) -> FlownFlight:
+def fly_in_lockstep(spec: FlightSpec, place: Place, recorder: InProcessRecorder | None = None) -> FlownFlight:
     """Fly in simulated time; the same specification and place give the same flight, bit for bit.
+
+    Parameters
+    ----------
+    spec, place
+        Who flies how, and where.
+    recorder
+        Records the service; it is closed by the caller.
 
     Raises
     ------
     companion.errors.CompanionError
         When the simulation itself failed.
     """
-    return run_lockstep(lambda loop: _fly(loop, spec, place), frame_s=spec.detection_s)
+    return run_lockstep(lambda loop: _fly(loop, spec, place, recorder), frame_s=spec.detection_s)
 
 
-async def _fly(loop: LockstepLoop, spec: FlightSpec, place: Place) -> FlownFlight:
+async def _fly(
+    loop: LockstepLoop, spec: FlightSpec, place: Place, in_process: InProcessRecorder | None
+) -> FlownFlight:
     clock = loop.clock
     recorder = FlightRecorder()
     summary: Mapping[str, float | None] = percentiles(())
@@ -68,8 +78,12 @@ async def _fly(loop: LockstepLoop, spec: FlightSpec, place: Place) -> FlownFligh
                     clock=clock,
                     open_frames=lambda: camera,
                     on_event=on_event,
+                    feed=None if in_process is None else in_process.feed,
                 )
             )
+            if in_process is not None:
+                recording = loop.create_task(in_process.run(clock), name="recorder")
+                stack.callback(recording.cancel)
             await service.wait_for("worker_ready", _WORKER_START_S)
             address = service.links[0].local_address
         planner = await stack.enter_async_context(Planner(address, rate_hz=spec.planner_hz, clock=clock))

@@ -281,6 +281,10 @@ class Service:
                 self._last_frame_ns,
             ),
             machine=Machine(Path(kept).parent if kept else Path(), clock=clock),
+            processes=lambda: {
+                "worker": vision.status.pid,
+                "io": None if self._io is None else self._io.pid,
+            },
             sections=self.sections,
             clock=clock,
             log=log,

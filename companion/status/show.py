@@ -154,8 +154,12 @@ def _processes(processes: Mapping[str, Mapping[str, Any]]) -> str:
 
 def _flat(part: object) -> str:
     if isinstance(part, Mapping):
-        return ", ".join(f"{name} {value}" for name, value in part.items())
-    return str(part)
+        return ", ".join(f"{name} {_plain(value)}" for name, value in part.items() if value not in ("", None))
+    return _plain(part)
+
+
+def _plain(value: object) -> str:
+    return ("yes" if value else "no") if isinstance(value, bool) else str(value)
 
 
 def _bytes(count: int) -> str:

@@ -33,6 +33,8 @@ class Snapshots:
         Returns what frames come from, what is wrong with that (None: nothing), and when the newest came (ns).
     machine
         The computer.
+    processes
+        Returns the pids of the processes that the service has started, by name; None: not running.
     sections
         Further parts by name, such as a recorder; may grow while the service runs.
     clock
@@ -51,6 +53,7 @@ class Snapshots:
         links: Sequence[Endpoint],
         source: Callable[[], tuple[str, str | None, int | None]],
         machine: Machine,
+        processes: Callable[[], Mapping[str, int | None]],
         sections: MutableMapping[str, Section],
         clock: Clock,
         log: Log,
@@ -62,6 +65,7 @@ class Snapshots:
         self._links = links
         self._source = source
         self._machine = machine
+        self._processes = processes
         self._sections = sections
         self._clock = clock
         self._log = log
@@ -71,8 +75,7 @@ class Snapshots:
 
     async def take(self) -> dict[str, Any]:
         """Return the status of now; plain values by stable names, ages in ms."""
-        processes = {"service": os.getpid(), "worker": self._vision.status.pid}
-        machine = await self._machine.look(processes)
+        machine = await self._machine.look({"service": os.getpid(), **self._processes()})
         now_ns = self._clock.now_ns()
         worker = self._vision.status
         url, fault, newest_ns = self._source()

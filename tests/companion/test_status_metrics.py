@@ -166,7 +166,7 @@ def test_a_service_that_knows_nothing_yet_has_metrics_too():
 
 
 def test_the_text_says_state_reason_rates_ages_links_worker_and_temperatures():
-    text = status_text({**STATUS, "recorder": {"state": "recording", "bytes": 12}})
+    text = status_text({**STATUS, "recorder": {"recording": True, "file": "", "bytes": 12}})
     for words in (
         "void-companion 0.1.0, up 1 h 2 min (pid 12)",
         "HOLD: no parallax; protection wanted; armed",
@@ -179,7 +179,7 @@ def test_the_text_says_state_reason_rates_ages_links_worker_and_temperatures():
         "in 1.5 kB, out 2.5 MB, 1 checksum errors",
         "load 25 %, memory 400 of 1800 MiB, cpu-thermal 52.1 C",
         "service 80.0 MiB, 3.5 s of processor, worker gone",
-        "recorder   state recording, bytes 12",
+        "recorder   recording yes, bytes 12",
     ):
         assert words in text
     assert "traceback" not in text

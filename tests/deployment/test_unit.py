@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,30 @@ def test_unit_and_installer_mean_the_same_paths_and_user():
     assert f"u {settings()['User'][0]} " in users
     for group in settings()["SupplementaryGroups"][0].split():
         assert f"m {settings()['User'][0]} {group}\n" in users
+
+
+def test_what_recorder_page_and_status_socket_need_is_allowed():
+    allowed = settings()
+    assert {"AF_UNIX", "AF_INET", "AF_INET6"} <= set(allowed["RestrictAddressFamilies"][0].split())
+    for folder in ("StateDirectory", "LogsDirectory", "RuntimeDirectory"):
+        assert allowed[folder] == ["void-companion"]
+    # Processes of our own are started with other priorities and may be ended by us: both are of this set.
+    assert "@system-service" in allowed["SystemCallFilter"]
+    assert int(allowed["TasksMax"][0]) >= 128
+
+
+def test_a_reload_is_the_signal_that_the_service_listens_to():
+    assert settings()["ExecReload"] == ["/bin/kill -HUP $MAINPID"]
+
+
+def test_the_live_page_is_installed_with_the_service():
+    extras = re.search(r"(?m)^extras=(\S+)", INSTALLER.read_text())
+    assert extras is not None
+    with (ROOT / "pyproject.toml").open("rb") as project:
+        assert set(extras[1].split(",")) <= set(tomllib.load(project)["project"]["optional-dependencies"])
+    carried = re.search(r'(?m)^EXTRAS: Final = "(.*)"$', (ROOT / "scripts" / "vm" / "wheels.py").read_text())
+    assert carried is not None
+    assert carried[1] == extras[1]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ from companion.config_reload_rules import WhenChanged, reason_to_restart, when_c
 _EFFECT: Final = re.compile(r"(?:^|(?<=[.;] ))(?=(?:Larger|Smaller|Higher|Lower)\b)")
 _UNIT_AT_END: Final = re.compile(r" \((?:deg|deg/s|m|m/s|s|ms|px|Hz|MiB)\)(?=\.?$)")
 _BOUNDS: Final = ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum")
+_FIRST: Final = ("guidance", "detector", "camera")
+"""What is tuned most comes first."""
 _KEPT_OUT: Final = (
     "engagement.",
     "web.",
@@ -34,7 +36,7 @@ def is_kept_out(key: str) -> bool:
 
 
 def settings_form() -> list[dict[str, Any]]:
-    """Return the tables of the configuration, each with its keys.
+    """Return the tables of the configuration, each with its keys; what is tuned most comes first.
 
     Returns
     -------
@@ -42,13 +44,17 @@ def settings_form() -> list[dict[str, Any]]:
     boolean, choice, text, list), ``unit``, ``choices``, the bounds as JSON Schema calls them, ``allowed`` in words,
     ``meaning``, ``effect``, ``default``, ``when`` (at once, new worker, restart), ``reason`` why a restart, and ``kept_out``.
     """
+    schemas = section_schemas()
+    order = sorted(schemas, key=lambda name: _FIRST.index(name) if name in _FIRST else len(_FIRST))
     return [
         {
             "name": section,
-            "description": schema.get("description", ""),
-            "keys": [_entry(f"{section}.{name}", facts) for name, facts in schema["properties"].items()],
+            "description": schemas[section].get("description", ""),
+            "keys": [
+                _entry(f"{section}.{name}", facts) for name, facts in schemas[section]["properties"].items()
+            ],
         }
-        for section, schema in section_schemas().items()
+        for section in order
     ]
 
 

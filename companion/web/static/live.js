@@ -122,6 +122,7 @@ export class LiveView {
     if (said !== this.states) {
       this.states = said;
       setText(byId("state-live"), said);
+      document.title = `${current.state} · Void companion`;
     }
     const changes = this.connection.lists.states.slice(-6).reverse();
     byId("state-list").replaceChildren(

@@ -180,7 +180,7 @@ function drawFocus({ context, unit }, [x, y]) {
   }
 }
 
-function drawPlanner({ context, unit, frameHeight }, [x, y]) {
+function drawPlanner({ context, unit, frameHeight }, [x]) {
   context.setLineDash([6 * unit, 5 * unit]);
   for (const [width, stroke] of [[4, BLACK], [2, "#ffb454"]]) {
     context.lineWidth = width * unit;
@@ -191,7 +191,7 @@ function drawPlanner({ context, unit, frameHeight }, [x, y]) {
     context.stroke();
   }
   context.setLineDash([]);
-  label({ context, unit }, "planned", x, y - 22 * unit, "#ffb454");
+  label({ context, unit }, "planned", x, 0.12 * frameHeight - 11 * unit, "#ffb454");
 }
 
 function drawDirection(pen, detection) {

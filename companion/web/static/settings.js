@@ -13,6 +13,7 @@ export class SettingsView {
     this.entries = new Map();
     this.configSeq = undefined;
     byId("settings-search").addEventListener("input", () => this.filter());
+    byId("settings-live-only").addEventListener("change", () => this.filter());
     byId("settings-apply").addEventListener("click", () => this.apply());
     byId("settings-undo").addEventListener("click", () => this.undo());
     byId("settings-discard").addEventListener("click", () => this.discard());
@@ -221,10 +222,11 @@ export class SettingsView {
 
   filter() {
     const wanted = byId("settings-search").value.trim().toLowerCase();
+    const liveOnly = byId("settings-live-only").checked;
     for (const section of this.form ? this.form.sections : []) {
       let any = false;
       for (const entry of section.keys) {
-        const found = !wanted || `${entry.key} ${entry.meaning} ${entry.effect}`.toLowerCase().includes(wanted);
+        const found = (!liveOnly || (entry.when !== "restart" && !entry.kept_out)) && (!wanted || `${entry.key} ${entry.meaning} ${entry.effect}`.toLowerCase().includes(wanted));
         this.rows.get(entry.key).row.hidden = !found;
         any ||= found;
       }

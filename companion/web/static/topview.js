@@ -6,7 +6,7 @@ import { rangeColour } from "./scene.js";
 export class TopView {
   constructor(canvas) {
     this.canvas = canvas;
-    this.radius = 6; // m from the middle to the nearest edge
+    this.radius = 4.5; // m from the middle to the nearest edge
   }
 
   zoom(factor) {

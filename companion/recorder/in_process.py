@@ -13,13 +13,16 @@ from companion.config import Config
 from companion.config.recorder import RecorderConfig
 from companion.errors import CompanionError
 from companion.io.feed import Feed
-from companion.io.messages import Answer, Kind, Wants
+from companion.io.messages import Answer, Kind, Message, Wants
 from companion.io.receiver import Receiver
+from companion.recorder.recording import CHUNK_BYTES
 from companion.recorder.sink import Recorder, wants_of
 
 _DRAIN_NS: Final = 20_000_000
 _EPOCH_NS: Final = 1_767_225_600_000_000_000
 """2026-01-01: simulated time has no date of its own, and the same flight makes the same file."""
+_LEAN: Final = frozenset({Kind.FRAME, Kind.DETECTION, Kind.STATE, Kind.LOOP, Kind.CONFIG, Kind.MAVLINK})
+_LARGE_CHUNK_BYTES: Final = 1 << 22
 
 
 class InProcessRecorder:
@@ -31,18 +34,28 @@ class InProcessRecorder:
         Where the recording goes.
     frames
         ``png``, ``jpeg`` or ``none``.
+    is_lean
+        Only what a replay needs, and packed for size in place of safety: for reference recordings.
     """
 
-    def __init__(self, folder: Path, *, frames: str = "png") -> None:
+    def __init__(self, folder: Path, *, frames: str = "png", is_lean: bool = False) -> None:
         recorder = RecorderConfig.model_validate(
             {"start": "always", "frames": frames, "frames_hz": 0.0, "keep_free_mib": 0.0, "tlog": False}
         )
         config = Config.model_construct(**{**dict(Config()), "recorder": recorder})
         self.feed = Feed()
-        self.feed.want(wants_of(config))
+        wants = wants_of(config)
+        self.feed.want(Wants(wants.kinds & _LEAN, wants.frames_hz) if is_lean else wants)
+        self._is_lean = is_lean
         self._receiver = Receiver()
         self._desk = _Desk()
-        self._recorder = Recorder(config, self._desk, folder=folder, wall_offset_ns=_EPOCH_NS)
+        self._recorder = Recorder(
+            config,
+            self._desk,
+            folder=folder,
+            wall_offset_ns=_EPOCH_NS,
+            chunk_bytes=_LARGE_CHUNK_BYTES if is_lean else CHUNK_BYTES,
+        )
         self._recorder.start()
 
     async def run(self, clock: Clock) -> None:
@@ -55,7 +68,8 @@ class InProcessRecorder:
         """Record what has happened by now."""
         for packet, fd in self.feed.packets():
             for message in self._receiver.messages(packet, () if fd is None else (os.dup(fd),)):
-                self._recorder.take(message)
+                if not (self._is_lean and _is_needless(message)):
+                    self._recorder.take(message)
 
     def close(self) -> None:
         """Record what is left, and finish the file.
@@ -71,6 +85,12 @@ class InProcessRecorder:
         self.feed.close()
         if self._desk.problem:
             raise CompanionError(f"not recorded: {self._desk.problem}")
+
+
+def _is_needless(message: Message) -> bool:
+    """Return whether a replay does without: what goes on to the planner is no decision."""
+    fields = message.fields
+    return message.kind is Kind.MAVLINK and fields["link"] == 0 and fields["direction"] == "out"
 
 
 class _Desk:

@@ -17,7 +17,7 @@ from companion.recorder import topics
 from companion.recorder.disk import GrowingFile
 from companion.recorder.frames import Frames
 
-_CHUNK_BYTES: Final = 16 * 1024
+CHUNK_BYTES: Final = 16 * 1024
 """Small: what is in an unfinished chunk is lost when we die. In flight that is a fraction of a second."""
 _TLOG_TIME: Final = struct.Struct(">Q")
 
@@ -35,6 +35,8 @@ class McapFile:
         Wall time less our monotonic time.
     about
         Metadata: how the recording began, by whom.
+    chunk_bytes
+        Compressed and written together.
 
     Raises
     ------
@@ -43,13 +45,16 @@ class McapFile:
     """
 
     def __init__(
-        self, file: GrowingFile, config: RecorderConfig, offset_ns: int, about: Mapping[str, str]
+        self,
+        file: GrowingFile,
+        config: RecorderConfig,
+        offset_ns: int,
+        about: Mapping[str, str],
+        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
         self._frames = Frames(config)
         self._offset_ns = offset_ns
-        self._writer = Writer(
-            cast("IO[Any]", file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD
-        )
+        self._writer = Writer(cast("IO[Any]", file), chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
         self._writer.start(profile="", library="void-companion")
         self._writer.add_metadata(topics.METADATA, {**about, "monotonic_to_wall_ns": str(offset_ns)})
@@ -150,7 +155,7 @@ class TlogFile:
         stamp = _TLOG_TIME.pack((message.time_ns + self._offset_ns) // 1000)
         for frame in frames_of(message.data):
             self._waiting += stamp + frame
-        if len(self._waiting) > _CHUNK_BYTES:
+        if len(self._waiting) > CHUNK_BYTES:
             self.flush()
 
     def flush(self) -> None:
@@ -188,6 +193,8 @@ class OpenRecording:
         Metadata.
     autopilot_links
         Numbers of the links whose MAVLink goes into the tlog.
+    chunk_bytes
+        Compressed and written together.
 
     Raises
     ------
@@ -202,12 +209,13 @@ class OpenRecording:
         offset_ns: int,
         about: Mapping[str, str],
         autopilot_links: frozenset[int],
+        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
         self._autopilot_links = autopilot_links
         self._files = [GrowingFile(name.with_name(name.name + ".mcap"))]
         self._tlog: TlogFile | None = None
         try:
-            self._mcap = McapFile(self._files[0], config, offset_ns, about)
+            self._mcap = McapFile(self._files[0], config, offset_ns, about, chunk_bytes)
             if config.tlog:
                 self._files.append(GrowingFile(name.with_name(name.name + ".tlog")))
                 self._tlog = TlogFile(self._files[1], offset_ns)

@@ -17,7 +17,7 @@ import cv2
 from companion.config import Config
 from companion.io.sink import Desk, Kind, Message, Sink, Wants
 from companion.recorder.disk import MIB, Limits, make_room, new_name
-from companion.recorder.recording import OpenRecording
+from companion.recorder.recording import CHUNK_BYTES, OpenRecording
 
 ALWAYS_KINDS: Final = frozenset(Kind) - {Kind.DETAILS, Kind.RING, Kind.ANSWER}
 _HELD: Final = frozenset({Kind.CONFIG, Kind.STATE, Kind.LINK})
@@ -64,6 +64,8 @@ class Recorder:
         Time for what is due by time.
     wall_offset_ns
         Wall time less the service's monotonic time; None: as this machine's clocks say when a file begins.
+    chunk_bytes
+        Compressed and written together: what of it is not full is lost when we die.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class Recorder:
         folder: Path | None = None,
         monotonic_s: Callable[[], float] = time.monotonic,
         wall_offset_ns: int | None = None,
+        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
         self._config = config.recorder
         self._wants = wants_of(config)
@@ -81,6 +84,7 @@ class Recorder:
         self._folder = folder if folder is not None else folder_of(config, os.environ)
         self._monotonic_s = monotonic_s
         self._wall_offset_ns = wall_offset_ns
+        self._chunk_bytes = chunk_bytes
         self._limits = Limits(
             round(self._config.file_mib * MIB),
             round(self._config.total_mib * MIB),
@@ -186,7 +190,9 @@ class Recorder:
             "boot_id": _boot_id(),
         }
         name = new_name(self._folder, time.time_ns())
-        self._recording = OpenRecording(name, self._config, offset_ns, about, self._autopilot_links)
+        self._recording = OpenRecording(
+            name, self._config, offset_ns, about, self._autopilot_links, self._chunk_bytes
+        )
         for message in self._held.values():
             self._recording.write(message)
 

@@ -91,6 +91,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="may be repeated; the first is what sizes holds (default: 1, then 2)",
     )
+    parser.add_argument(
+        "--clock",
+        choices=("wall", "cpu"),
+        default="wall",
+        help="elapsed time, or processor time where the machine has other work (default: %(default)s)",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw time against size and points")
 
@@ -130,6 +136,7 @@ def figures_of(options: argparse.Namespace) -> dict[str, Any]:
         repeats=options.repeats,
         threads=tuple(dict.fromkeys(options.threads or (1, 2))),
         literal=bench.literal_reference(),
+        clock=options.clock,
         progress=_say if sys.stderr.isatty() else None,
     )
     return {"preset": options.preset, "frames": source, **figures}
@@ -166,7 +173,7 @@ def table_of(figures: dict[str, Any]) -> str:
     machine = figures["machine"]
     lines += [
         "",
-        f"Times in ms (medians). Frames: {figures['frames']}. Preset {figures['preset']}, speed {figures['speed']}, "
+        f"Times in ms (medians{', processor time' if figures['clock'] == 'cpu' else ''}). Frames: {figures['frames']}. Preset {figures['preset']}, speed {figures['speed']}, "
         + (
             "no literal transcription here. "
             if figures["literal_n_init"] is None
@@ -178,6 +185,8 @@ def table_of(figures: dict[str, Any]) -> str:
 
 
 def _run(options: argparse.Namespace) -> int:
+    if options.plot is not None:
+        inputs.check_picture_path("--plot", options.plot)
     figures = figures_of(options)
     if options.plot is not None:
         from detector.drawing.performance import performance_chart
@@ -192,6 +201,8 @@ def _run(options: argparse.Namespace) -> int:
 
 def _given(paths: list[Path], count: int) -> tuple[list[NDArray[np.uint8]], str]:
     """Return the images that the command line names, and how to call them."""
+    if len(paths) == 1 and not paths[0].exists():
+        raise InputError(f"{paths[0]}: cannot be read: No such file or directory")
     if len(paths) == 1 and paths[0].is_dir():
         files = _files_of(paths[0])[:count]
         if len(files) < 2:

@@ -257,6 +257,24 @@ def write_picture(option: str, path: Path, picture: NDArray[np.uint8]) -> None:
         raise InputError(f"{option} {path}: cannot be written: {cause(error)}") from error
 
 
+def check_picture_path(option: str, path: Path) -> None:
+    """Say before long work that :func:`write_picture` would fail after it.
+
+    Raises
+    ------
+    InputError
+        The folder is not there, or no image format has this ending.
+    """
+    import cv2
+
+    if not path.parent.is_dir():
+        raise InputError(f"{option} {path}: {path.parent} is not a folder")
+    if not cv2.haveImageWriter(f"picture{path.suffix}"):
+        raise InputError(
+            f"{option} {path}: found the ending {path.suffix!r}, allowed is an image format such as .png"
+        )
+
+
 def json_clean(value: Any) -> Any:
     """Return the value with lists for tuples and null for figures that are not finite, which JSON has no word for."""
     if isinstance(value, dict):

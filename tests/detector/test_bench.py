@@ -51,6 +51,17 @@ def test_every_series_is_measured_on_every_pair_and_thread_setting(figures):
     assert counts[0] < 200 < counts[-1]
 
 
+def test_with_the_processors_clock_waiting_is_not_counted(monkeypatch):
+    ticks = iter(range(1_000_000))
+    monkeypatch.setattr(bench, "CLOCKS", {"cpu": lambda: float(next(ticks))})
+    found = bench.run({SMALL: generated_stream(SMALL, 3)}, PARAMS, repeats=1, threads=(1,), clock="cpu")
+    assert found["clock"] == "cpu"
+    row = found["sizes"]["320x240"]
+    assert row["floor_s"]["median"] == 1.0  # two looks at that clock, and no other clock
+    for loop in ("first", "other"):
+        assert all(step["median"] == int(step["median"]) for step in row["steps"][loop].values())
+
+
 def test_steps_add_up_to_the_whole(figures):
     row = figures["sizes"]["320x240"]
     for name in ("first", "other", "sfm"):
@@ -188,7 +199,10 @@ def test_a_chart_without_literal_and_points_is_drawn(figures):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["a.png"], "allowed are two images or one folder"),
+        (["{there}"], "allowed are two images or one folder"),
+        (["a.png"], "a.png: cannot be read"),
+        (["--plot", "no/such/plot.png"], "--plot no/such/plot.png: no/such is not a folder"),
+        (["--plot", "plot.xyz"], "found the ending '.xyz'"),
         (["no/such.png", "b.png"], "cannot be read"),
         (["{empty}"], "found 0 images"),
         (["--preset", "nobody"], "allowed are default, paper"),
@@ -197,7 +211,14 @@ def test_a_chart_without_literal_and_points_is_drawn(figures):
 )
 def test_bad_input_is_one_clear_line(capsys, tmp_path, arguments, words):
     (tmp_path / "strict.toml").write_text("min_width_px = 100\n")
-    named = [each.format(empty=tmp_path / "none", strict=tmp_path / "strict.toml") for each in arguments]
+    named = [
+        each.format(
+            empty=tmp_path / "none",
+            strict=tmp_path / "strict.toml",
+            there=OFFICE / "00184.jpg",
+        )
+        for each in arguments
+    ]
     (tmp_path / "none").mkdir()
     assert main(["bench", *named]) == 2
     err = capsys.readouterr().err

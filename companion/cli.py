@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import os
 import signal
 import sys
@@ -158,6 +157,8 @@ _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    import asyncio
+
     from companion.clock import RealClock
     from companion.config_sources import ConfigPlaces, load
     from companion.event_loop import loop_factory
@@ -206,6 +207,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _check_config(arguments: argparse.Namespace) -> int:
+    import asyncio
+
     from companion.clock import RealClock
     from companion.config_sources import ConfigPlaces, load
     from companion.log import open_log

@@ -7,8 +7,9 @@ width and scaled with the width of the image (:func:`scaled_px`); the other pixe
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -375,7 +376,7 @@ class DetectorParams(BaseModel):
         """
         if name not in _PRESETS:
             raise ParamsError(f"preset: found {name!r}, allowed are {', '.join(sorted(_PRESETS))}")
-        return _validated({**_PRESETS[name], **overrides}, source=f"preset {name}")
+        return validated(cls, {**_PRESETS[name], **overrides}, source=f"preset {name}")
 
     @classmethod
     def from_toml(cls, path: Path, preset: PresetName = "default") -> DetectorParams:
@@ -386,17 +387,28 @@ class DetectorParams(BaseModel):
         ParamsError
             The file cannot be read or parsed, or a key is unknown, of the wrong type or out of range.
         """
-        try:
-            overrides = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise ParamsError(f"{path}: cannot be read: {error.strerror or error}") from error
-        except UnicodeDecodeError as error:
-            raise ParamsError(f"{path}: is not UTF-8 text") from error
-        except tomllib.TOMLDecodeError as error:
-            raise ParamsError(f"{path}: is not valid TOML: {error}") from error
+        overrides = read_toml(path)
         if preset not in _PRESETS:
             raise ParamsError(f"preset: found {preset!r}, allowed are {', '.join(sorted(_PRESETS))}")
-        return _validated({**_PRESETS[preset], **overrides}, source=str(path))
+        return validated(cls, {**_PRESETS[preset], **overrides}, source=str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return what a TOML file of parameters holds.
+
+    Raises
+    ------
+    ParamsError
+        The file cannot be read or parsed.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ParamsError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ParamsError(f"{path}: is not UTF-8 text") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ParamsError(f"{path}: is not valid TOML: {error}") from error
 
 
 _PRESETS: dict[str, dict[str, Any]] = {
@@ -420,18 +432,37 @@ def scaled_px(value_at_1280: float, width_px: int) -> float:
     return value_at_1280 * width_px / REFERENCE_WIDTH_PX
 
 
-def _validated(values: dict[str, Any], source: str) -> DetectorParams:
+Params = TypeVar("Params", bound=BaseModel)
+
+
+def validated(model: type[Params], values: Mapping[str, Any], source: str) -> Params:
+    """Return a method's parameters from what a file or a person gave.
+
+    Parameters
+    ----------
+    model
+        :class:`DetectorParams`, or those of another method.
+    values
+        By field; the others have their defaults.
+    source
+        What the message names.
+
+    Raises
+    ------
+    ParamsError
+        A key is unknown, of the wrong type or out of range; one line each.
+    """
     try:
-        return DetectorParams.model_validate(values)
+        return model.model_validate(dict(values))
     except ValidationError as error:
-        lines = [_explain(source, item) for item in error.errors()]
+        lines = [_explain(model, source, item) for item in error.errors()]
         raise ParamsError("\n".join(lines)) from error
 
 
-def _explain(source: str, item: Any) -> str:
+def _explain(model: type[BaseModel], source: str, item: Any) -> str:
     key = ".".join(str(part) for part in item["loc"]) or "parameters"
     if item["type"] == "extra_forbidden":
-        allowed = ", ".join(sorted(DetectorParams.model_fields))
+        allowed = ", ".join(sorted(model.model_fields))
         return f"{source}: {key}: unknown key (found {item['input']!r}); allowed are {allowed}"
     message = item["msg"].removeprefix("Value error, ")
     if not item["loc"]:

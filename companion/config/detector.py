@@ -25,7 +25,7 @@ class DetectorConfig(Section):
     params_file: Annotated[
         str,
         Field(
-            description="TOML file with parameters of the method paper that replace those of the preset; empty: none."
+            description="TOML file with parameters of the method that replace its own: of paper those of the preset, of parallax (method must be named then) those of detector/parallax/params.py. companion tune writes such files. Empty: none."
         ),
     ] = ""
     deadline_s: Annotated[
@@ -112,8 +112,6 @@ class DetectorConfig(Section):
         return table
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
-        if self.method == "parallax" and self.params_file:
-            return (Disagreement("params_file", self.params_file, 'empty where method is "parallax"'),)
         if self.restart_delay_s <= self.restart_delay_max_s:
             return ()
         return (

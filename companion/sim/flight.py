@@ -77,6 +77,8 @@ class FlightSpec:
     frame_drop_rate, frame_latency_s, frame_jitter_s
         Share of frames that never come; from exposure to hand-over, and up to how much longer. In simulated time no
         frame may take as long as it is to the next.
+    settings
+        Of the service, by table and key, over those that a flight has anyway.
     """
 
     world: str = "room"
@@ -97,6 +99,7 @@ class FlightSpec:
     frame_drop_rate: float = 0.0
     frame_latency_s: float = 0.0
     frame_jitter_s: float = 0.0
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):

@@ -41,13 +41,16 @@ def autopilot_of(spec: FlightSpec, place: Place, clock: Clock) -> FakeAutopilot:
 
 def service_tables(spec: FlightSpec, autopilot: Address) -> dict[str, dict[str, Any]]:
     """Return the service's configuration for a flight with it, its frame source left out."""
-    return {
+    tables: dict[str, dict[str, Any]] = {
         "detector": {"method": spec.method},
         "source": {"min_rate_hz": min(2.0, 0.4 * spec.frame_rate_hz)},
         "camera": {"hfov_deg": spec.hfov_deg},
         "link": {"autopilot": "udpout:{}:{}".format(*autopilot)},
         "log": {"status_interval_s": 0.0, "detections": True},
     }
+    for name, table in spec.settings.items():
+        tables.setdefault(name, {}).update(table)
+    return tables
 
 
 def camera_model_of(spec: FlightSpec) -> CameraModel:

@@ -62,9 +62,9 @@ def build_pipeline(detector: DetectorConfig, camera: CameraConfig) -> VoidPipeli
     )
     if detector.method == "parallax":
         # Only here: the worker loads one method.
-        from companion.vision.parallax_child import ParallaxPipeline
+        from companion.vision.parallax_child import ParallaxPipeline, parallax_params
 
-        return ParallaxPipeline(camera, calibrated, vehicle)
+        return ParallaxPipeline(camera, calibrated, vehicle, parallax_params(detector.params_file))
     try:
         if detector.params_file:
             params = DetectorParams.from_toml(Path(detector.params_file), detector.preset)

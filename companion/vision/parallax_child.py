@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.config import CameraConfig
+from companion.errors import ConfigError
 from companion.frames.source import Frame
 from companion.guidance.observation import BearingRange, DetectionReport, Pose
 from companion.vision.child import BEARING_STEP_RAD, FrameObserver, Vector, VoidPipeline, obstacles_seen
 from companion.vision.details import Arrays, parallax_arrays
 from detector.camera_model import CameraModel
 from detector.observer import Observation, ObserverParams
+from detector.parallax.params import ParallaxParams
 from detector.parallax.samples import RangedSamples
 from detector.parallax.stream import MapReading, ParallaxObservation, ParallaxObserver
 from detector.parallax.void_map import BINS, VoidMap, VoidMapParams
-from detector.params import DetectorParams
+from detector.params import DetectorParams, ParamsError, read_toml, validated
 
 _NEAR_M = 3.0
 _STEP_BINS = round(BEARING_STEP_RAD / math.tau * BINS)
@@ -37,13 +40,21 @@ class ParallaxPipeline(VoidPipeline):
         The camera file's model, at the size that it was made for.
     vehicle
         Its size, and how far apart the frames of a pair are taken.
+    params
+        The method's own.
     """
 
     _method = "parallax"
 
-    def __init__(self, camera: CameraConfig, calibrated: CameraModel | None, vehicle: ObserverParams) -> None:
+    def __init__(
+        self,
+        camera: CameraConfig,
+        calibrated: CameraModel | None,
+        vehicle: ObserverParams,
+        params: ParallaxParams | None = None,
+    ) -> None:
         super().__init__(DetectorParams.preset("default"), camera, calibrated, vehicle)
-        self._vehicle = vehicle
+        self._vehicle, self._parallax_params = vehicle, params
         self._camera_source = "field_of_view" if calibrated is None else "calibration"
         self._map_params = VoidMapParams(
             radius_m=0.5 * vehicle.vehicle_width_m, half_height_m=0.5 * vehicle.vehicle_height_m
@@ -67,6 +78,7 @@ class ParallaxPipeline(VoidPipeline):
 
     def _observer_of(self, model: CameraModel) -> FrameObserver:
         return ParallaxObserver(
+            self._parallax_params,
             map_params=self._map_params,
             camera=model,
             camera_source=self._camera_source,
@@ -104,6 +116,20 @@ class ParallaxPipeline(VoidPipeline):
                 near_points_m(reading.samples), np.eye(3), pose, self._vehicle.vehicle_height_m
             ),
         )
+
+
+def parallax_params(file: str) -> ParallaxParams:
+    """Return the method's parameters with those of a file, which is named where there is one.
+
+    Raises
+    ------
+    companion.errors.ConfigError
+        The file cannot be used.
+    """
+    try:
+        return validated(ParallaxParams, read_toml(Path(file)), file) if file else ParallaxParams()
+    except ParamsError as error:
+        raise ConfigError(f"detector.params_file: {error}") from error
 
 
 def bearings_of(found: VoidMap, wanted: NDArray[np.bool_], radius_m: float) -> tuple[BearingRange, ...]:

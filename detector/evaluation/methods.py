@@ -141,11 +141,19 @@ class PaperMethod(_Lines):
 
 
 class ParallaxMethod(_Lines):
-    """The parallax method (:class:`detector.parallax.pipeline.ParallaxDetector`), each pair by itself."""
+    """The parallax method (:class:`detector.parallax.pipeline.ParallaxDetector`), each pair by itself.
 
-    def __init__(self, params: DetectorParams) -> None:
+    Parameters
+    ----------
+    params
+        What counts as a usable frame.
+    parallax
+        The method's own; by default those it has.
+    """
+
+    def __init__(self, params: DetectorParams, parallax: ParallaxParams | None = None) -> None:
         super().__init__(params)
-        self._detector = ParallaxDetector(frame_params=params)
+        self._detector = ParallaxDetector(parallax, frame_params=params)
 
     def vanishing_point(self, image: NDArray[np.uint8], /) -> tuple[float, float] | None:
         """Return where whole-image segments meet (:mod:`detector.parallax.line_vp`)."""

@@ -211,7 +211,9 @@ def test_a_resized_image_of_the_calibrated_camera_is_used(tmp_path: Path, wall_f
     config = CameraConfig(file=str(write_camera_file(tmp_path / "camera.toml")))
     assert [r.reason for r in reports_on(wall_flight[:1], config)] == ["no_earlier_frame"]
     half = Frame(np.ascontiguousarray(wall_flight[0][0].image[::2, ::2]), 1, 0)
-    assert build_pipeline(DetectorConfig(method="paper"), config).detect(half, None).reason == "no_earlier_frame"
+    assert (
+        build_pipeline(DetectorConfig(method="paper"), config).detect(half, None).reason == "no_earlier_frame"
+    )
 
 
 def test_a_frame_of_another_size_starts_anew(wall_flight):
@@ -246,6 +248,16 @@ def test_a_parameter_that_cannot_be_is_a_configuration_error(tmp_path: Path):
     (tmp_path / "params.toml").write_text("clusters_min = -3\n")
     with pytest.raises(ConfigError, match="clusters_min"):
         build_pipeline(DetectorConfig(params_file=str(tmp_path / "params.toml")), CameraConfig())
+
+
+def test_the_void_map_takes_parameters_from_a_file(tmp_path: Path):
+    file = tmp_path / "params.toml"
+    file.write_text("round_trip_px = 0.9\n")
+    config = DetectorConfig(method="parallax", params_file=str(file))
+    assert build_pipeline(config, CameraConfig())._parallax_params.round_trip_px == 0.9
+    file.write_text("clusters_min = 3\n")  # the paper's
+    with pytest.raises(ConfigError, match=r"params_file: .*clusters_min: unknown key"):
+        build_pipeline(config, CameraConfig())
 
 
 async def test_the_real_worker_reports_the_wall(wall_flight, wall_reports):

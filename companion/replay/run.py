@@ -16,6 +16,8 @@ from companion.replay.detections import Detections, in_words, same_answer
 from companion.replay.inputs import ReplayedCore, report_of
 
 DetectionsFrom = Literal["recorded", "rerun"]
+_NEEDED: Final = frozenset({"frame", "frame_memory", "detection", "mavlink", "loop", "config", "state"})
+"""What a replay depends on; of the rest the newest are enough."""
 _INPUTS: Final = frozenset({Kind.DETECTION, Kind.LOOP, Kind.CONFIG})
 
 
@@ -184,8 +186,11 @@ class _Run:
             if self._detector is not None:
                 self._detector.begin_anew()
         elif message.kind is Kind.CONTROL and message.fields.get("name") == "dropped":
-            by, counts = message.fields.get("by"), message.fields.get("counts")
-            self._summary.notes.append(f"incomplete: {by} lost {counts} up to {self._since_s(message):.1f} s")
+            counts = dict(message.fields.get("counts", {}))
+            lost = ", ".join(f"{count} {kind}" for kind, count in counts.items() if kind in _NEEDED)
+            if lost:
+                by, since_s = message.fields.get("by"), self._since_s(message)
+                self._summary.notes.append(f"incomplete: {by} had lost {lost} by {since_s:.1f} s")
 
     def _turn(self, message: Message, recorded: list[Decision]) -> None:
         summary = self._summary

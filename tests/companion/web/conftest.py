@@ -69,7 +69,7 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Served]]:
         def start(**web: Any) -> Served:
             settings_file = tmp_path / "config.toml"
             settings_file.write_text(SETTINGS_TOML)
-            port = free_port()
+            port = web.pop("port", None) or free_port()
             config = config_for(port, settings_file, **web)
             desk = FakeDesk(config)
             page = build(config, desk)

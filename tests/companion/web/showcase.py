@@ -233,7 +233,7 @@ class Showcase:
 
     def _publish(self, now_ns: int) -> None:
         number = self._number = self._number + 1
-        place = number % (2 * len(self._looked) - 2)  # there and back again: nothing leaps
+        place = number % max(1, 2 * len(self._looked) - 2)  # there and back again: nothing leaps
         looked = self._looked[place if place < len(self._looked) else 2 * len(self._looked) - 2 - place]
         pose, image = looked.pose, looked.image
         height_px, width_px = image.shape

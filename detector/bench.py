@@ -13,10 +13,12 @@ Measured on every pair of a stream, each with frames that are as a camera gives 
     from the frame to its answer. What follows the answer, renewing the locations for the next pair, is timed on its own (``renewal``).
 ``floor``
     The Lucas-Kanade calls alone, there and back, on the very points that ``other`` started from, with its window, levels and iterations, on plain arrays.
+``parallax``
+    The method ``parallax`` in a stream, without poses: one frame prepared, one pair answered, rotation and direction of travel from the flow. With an attitude it takes less.
 ``sfm``
     Two-view structure from motion (:mod:`detector.two_view`), which the paper compares its time with.
 
-The order of the six turns from pair to pair, so that caches and other load on the machine favour none of them.
+The order of the seven turns from pair to pair, so that caches and other load on the machine favour none of them.
 
 Time is elapsed time, or processor time of all threads where the machine has other work to do (:data:`CLOCKS`): then a busy machine costs caches, not waiting.
 """
@@ -45,6 +47,7 @@ from detector import flow, two_view
 from detector.bench_frames import Stream
 from detector.bench_memory import peak_memory
 from detector.camera_model import CameraModel
+from detector.parallax.pipeline import Intrinsics, ParallaxDetector
 from detector.params import DetectorParams
 from detector.pipeline import VoidDetector
 from detector.results import Detection, Direction, SinglePlane
@@ -52,7 +55,7 @@ from detector.results import Detection, Direction, SinglePlane
 Clock = Callable[[], float]
 CLOCKS: Final[Mapping[str, Clock]] = MappingProxyType({"wall": time.perf_counter, "cpu": time.process_time})
 """Seconds by name: as on the wall, or those that the processors spent on this process."""
-SERIES: Final = ("literal", "literal_other", "first", "other", "floor", "sfm")
+SERIES: Final = ("literal", "literal_other", "first", "other", "floor", "parallax", "sfm")
 _LITERAL_FILE: Final = Path(__file__).parents[1] / "tests" / "reference" / "paper.py"
 _ASSUMED_HFOV_DEG: Final = 80.0
 """For structure from motion, which needs a camera; its time hardly depends on which."""
@@ -67,7 +70,7 @@ class Samples:
 
     seconds: dict[str, list[float | None]] = field(default_factory=lambda: {name: [] for name in SERIES})
     steps: dict[str, list[dict[str, float]]] = field(
-        default_factory=lambda: {name: [] for name in ("first", "other", "sfm")}
+        default_factory=lambda: {name: [] for name in ("first", "other", "parallax", "sfm")}
     )
     points: dict[str, list[int]] = field(default_factory=lambda: {name: [] for name in ("first", "other")})
     renewal_s: list[float] = field(default_factory=list)
@@ -249,7 +252,9 @@ class _Paths:
     ) -> None:
         self._clock = clock
         self._stream, self._params, self._literal = stream, params, literal
-        self._warmed = [name for name in ("other", "first", "sfm") if name in series]  # literal is, below
+        self._warmed = [
+            name for name in ("other", "first", "parallax", "sfm") if name in series
+        ]  # literal is, below
         height, width = stream[0].shape
         self._camera = CameraModel.from_hfov(width, height, _ASSUMED_HFOV_DEG)
         self._kept: Any = None
@@ -272,6 +277,8 @@ class _Paths:
         self._detector.detect(self._earlier, later)
         self._detector.renew(later)
         self._earlier = later
+        self._parallax = ParallaxDetector(frame_params=self._params, timer=self._clock)
+        self._parallax_earlier = self._parallax.prepare(self._stream[1])
 
     def warm_up(self, pair: int) -> None:
         """Run once what is measured later; this also finds the points that the other loops start from."""
@@ -294,6 +301,8 @@ class _Paths:
             samples.note(series, seconds if answered else None, answer.kind)
         elif series in ("first", "other"):
             self._our_loop(series, pair, samples)
+        elif series == "parallax":
+            self._parallax_loop(pair, samples)
         elif series == "floor":
             points = self._points.get(pair)
             if points is None or len(points) < _FEWEST_POINTS:
@@ -336,6 +345,21 @@ class _Paths:
             steps["frames"] = steps.get("frames", 0.0) + prepared - begin
             samples.steps[series].append(steps)
             samples.points[series].append(0 if earlier.seeds_px is None else len(earlier.seeds_px))
+
+    def _parallax_loop(self, pair: int, samples: Samples) -> None:
+        begin = self._clock()
+        later = self._parallax.prepare(self._stream[pair + 1])
+        prepared = self._clock()
+        intrinsics = Intrinsics(self._camera, "assumed")
+        detection = self._parallax.detect(self._parallax_earlier, later, intrinsics=intrinsics).detection
+        end = self._clock()
+        self._parallax_earlier = later
+        answered = isinstance(detection, Direction | SinglePlane)
+        samples.note("parallax", end - begin if answered else None, _kind_of(detection))
+        if answered:
+            steps = dict(detection.diagnostics.seconds)
+            steps["frames"] = steps.get("frames", 0.0) + prepared - begin
+            samples.steps["parallax"].append(steps)
 
     def _literal_answer(self, pair: int, kept: Any) -> Any:
         literal = self._literal

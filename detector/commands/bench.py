@@ -33,6 +33,7 @@ what is measured (seconds; a pair without an answer does not count)
   first                    our first loop: both frames prepared, p, n and k estimated
   other                    our other loops in a stream: one frame prepared, one pair answered, p, n and k kept
   floor                    Lucas-Kanade alone, there and back, on the points that other started from
+  parallax                 the method parallax in a stream without poses: one frame prepared, one pair answered
   sfm                      two-view structure from motion
 Ratios are medians over the pairs of the ratio on each pair.
 
@@ -147,10 +148,10 @@ def table_of(figures: dict[str, Any]) -> str:
     blocks = {str(figures["threads"]): figures["sizes"], **figures["more_threads"]}
     lines = [
         (
-            "| size | threads | literal first, other | ours first | ours other, p95 | then renewal, p95 | LK floor | SfM | literal / first | literal / other "
+            "| size | threads | literal first, other | ours first | ours other, p95 | then renewal, p95 | LK floor | parallax, p95 | SfM | literal / first | literal / other "
             "| other / floor | peak |"
         ),
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for threads, sizes in blocks.items():
         for size, row in sizes.items():
@@ -162,6 +163,7 @@ def table_of(figures: dict[str, Any]) -> str:
                 f"{_ms(row['other_s'])}, {_ms(row['other_s'], 'p95')}",
                 f"{_ms(row['renewal_s'])}, {_ms(row['renewal_s'], 'p95')}",
                 _ms(row["floor_s"]),
+                f"{_ms(row['parallax_s'])}, {_ms(row['parallax_s'], 'p95')}",
                 _ms(row["sfm_s"]),
                 *(
                     "-" if row[key] is None else f"{row[key]:.1f}"

@@ -15,6 +15,7 @@ from detector.drawing.palette import (
     CHART_VERMILLION,
     GREY,
     INK,
+    ORANGE,
     Colour,
 )
 from detector.drawing.sheet import side_by_side
@@ -24,6 +25,7 @@ _MS: Final = 1e3
 _LINES: Final[tuple[tuple[str, str, Colour], ...]] = (
     ("literal", "literal, first loop", INK),
     ("literal_other", "literal, other loops", GREY),
+    ("parallax", "method parallax", ORANGE),
     ("sfm", "structure from motion", CHART_PURPLE),
     ("first", "first loop", CHART_VERMILLION),
     ("other", "other loops", CHART_BLUE),

@@ -43,6 +43,7 @@ def test_every_series_is_measured_on_every_pair_and_thread_setting(figures):
             assert 0.0 < row[f"{name}_s"]["median"] <= row[f"{name}_s"]["p95"]
             assert sum(row["answers"][name].values()) == 4
         assert {"frames", "features", "flow", "clusters", "lines"} <= set(row["steps"]["other"])
+        assert set(row["steps"]["parallax"]) == {"frames", "flow", "motion", "plane", "ranges", "map"}
         assert set(row["steps"]["sfm"]) == {"features", "matching", "essential", "triangulation"}
     assert figures["literal_n_init"] == PARAMS.kmeans_restarts
     counts = [each["n"] for each in figures["points"]]
@@ -58,13 +59,13 @@ def test_with_the_processors_clock_waiting_is_not_counted(monkeypatch):
     assert found["clock"] == "cpu"
     row = found["sizes"]["320x240"]
     assert row["floor_s"]["median"] == 1.0  # two looks at that clock, and no other clock
-    for loop in ("first", "other"):
+    for loop in ("first", "other", "parallax"):
         assert all(step["median"] == int(step["median"]) for step in row["steps"][loop].values())
 
 
 def test_steps_add_up_to_the_whole(figures):
     row = figures["sizes"]["320x240"]
-    for name in ("first", "other", "sfm"):
+    for name in ("first", "other", "parallax", "sfm"):
         steps = sum(step["median"] for step in row["steps"][name].values())
         assert 0.3 * row[f"{name}_s"]["median"] < steps < 2.0 * row[f"{name}_s"]["median"]
 

@@ -161,7 +161,13 @@ class OwnComponent:
         """Take one frame of `message_ids`; return whether it was for us alone and is not to be passed on."""
         message_id = frame.message_id
         if message_id in _COUNTED:  # first: these are most of all frames
-            if not from_autopilot or not self._is_vehicles(frame):
+            vehicle = self._speaker.vehicle
+            if (
+                not from_autopilot
+                or vehicle is None
+                or frame[2] != vehicle.system_id
+                or frame[3] != _AUTOPILOT_COMPONENT
+            ):
                 return False
             self._streams.count(message_id)
             if message_id not in _READ:

@@ -162,9 +162,8 @@ class Endpoint(ABC):
     def _deliver(self, frames: list[RawFrame]) -> None:
         """Count what the senders' sequence numbers say is missing, and hand the frames on."""
         sequences = self._sequences
-        for frame in frames:
-            data = frame.data
-            sender = frame.system_id << 8 | frame.component_id
+        for data, _, system_id, component_id, _ in frames:
+            sender = system_id << 8 | component_id
             sequence = data[4] if data[0] == 0xFD else data[2]
             last = sequences.get(sender)
             if last is not None:

@@ -26,6 +26,8 @@ https://mavlink.io/en/guide/serialization.html
 from __future__ import annotations
 
 import re
+import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple
@@ -39,6 +41,10 @@ HEADER_V2: Final = 10
 CHECKSUM_BYTES: Final = 2
 SIGNATURE_BYTES: Final = 13
 INCOMPAT_SIGNED: Final = 0x01
+_V1: Final = struct.Struct("<6B")
+_V2: Final = struct.Struct("<7BHB")
+_V1_OVERHEAD: Final = HEADER_V1 + CHECKSUM_BYTES
+_V2_OVERHEAD: Final = HEADER_V2 + CHECKSUM_BYTES
 MAX_FRAME_BYTES: Final = HEADER_V2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 
 CURRENT_MODE: Final = 436
@@ -118,13 +124,15 @@ def checksum(covered: bytes, message_id: int) -> int:
     return _crc(_CRC_EXTRA[message_id], _crc(covered, 0xFFFF))
 
 
-def _crc(data: bytes, start: int) -> int:
-    if mcrf4xx is not None:  # compiled, 0.2 us whatever the length
-        return int(mcrf4xx(data, start))
+def _plain_crc(data: bytes, start: int) -> int:
     accumulator = x25crc()
     accumulator.crc = start
     accumulator.accumulate(data)
     return int(accumulator.crc)
+
+
+_crc: Final[Callable[[bytes, int], int]] = _plain_crc if mcrf4xx is None else mcrf4xx
+"""CRC-16/MCRF4XX of bytes, going on from a start; compiled where pymavlink is: 0.2 us whatever the length."""
 
 
 @dataclass(slots=True)
@@ -208,6 +216,40 @@ def _classify(buffer: bytes, start: int, size: int) -> tuple[_Kind, int, int]:
     return _Kind.VERIFIED if good else _Kind.CORRUPT, end, message_id
 
 
+def _walk(buffer: bytes, position: int, frames: list[RawFrame]) -> int:
+    """Append the verified frames that stand one behind the other from ``position`` on; return where they end.
+
+    It does what `_classify` and `_frame` do, for the one case that nearly every frame is: every frame that is forwarded comes
+    through here, and calls are what it costs. A signature in which a frame may begin is left to be weighed.
+    """
+    size = len(buffer)
+    while position < size:
+        magic = buffer[position]
+        if magic == MAGIC_V2 and position + _V2_OVERHEAD <= size:
+            _, length, flags, _, _, system_id, component_id, low, high = _V2.unpack_from(buffer, position)
+            message_id = high << 16 | low
+            end = position + length + _V2_OVERHEAD
+        elif magic == MAGIC_V1 and position + _V1_OVERHEAD <= size:
+            _, length, _, system_id, component_id, message_id = _V1.unpack_from(buffer, position)
+            flags = 0
+            end = position + length + _V1_OVERHEAD
+        else:
+            break
+        extra = _CRC_EXTRA.get(message_id)
+        if extra is None or end > size:
+            break
+        crc = _crc(extra, _crc(buffer[position + 1 : end - CHECKSUM_BYTES], 0xFFFF))
+        if crc != buffer[end - 2] | buffer[end - 1] << 8:
+            break
+        if flags & INCOMPAT_SIGNED:
+            end += SIGNATURE_BYTES
+            if end > size or _MAGIC.search(buffer, end - SIGNATURE_BYTES, end):
+                break
+        frames.append(RawFrame(buffer[position:end], message_id, system_id, component_id, True))
+        position = end
+    return position
+
+
 def _sender(buffer: bytes, start: int) -> tuple[int, int]:
     """Return system and component id of the frame at ``start``, whose header must be complete."""
     at = start + (5 if buffer[start] == MAGIC_V2 else 3)
@@ -255,23 +297,17 @@ class Framer:
         size = len(buffer)
         # The usual case, a walk over verified frames. Anything else is weighed with all that follows it.
         anchored = not boundary or self._held_is_anchored
-        while anchored and position < size and buffer[position] in (MAGIC_V1, MAGIC_V2):
-            kind, end, message_id = _classify(buffer, position, size)
-            if kind is not _Kind.VERIFIED or (
-                buffer[position] == MAGIC_V2
-                and buffer[position + 2] & INCOMPAT_SIGNED
-                and _MAGIC.search(buffer, end - SIGNATURE_BYTES, end)
-            ):
-                break
-            frames.append(_frame(buffer, position, end, message_id, verified=True))
-            position = end
-            self._passed = b""
+        if anchored:
+            walked = _walk(buffer, position, frames)
+            if walked > position:
+                position = walked
+                self._passed = b""
         if position < size:
             self._weigh(buffer, position, boundary, frames, anchored or position > 0)
         self.counters.frames += len(frames)
-        for frame in frames:
-            if frame.verified:
-                self._senders.add((frame.system_id, frame.component_id))
+        for _, _, system_id, component_id, verified in frames:
+            if verified:
+                self._senders.add((system_id, component_id))
         return frames
 
     def _look_back(self, datagram: bytes, size: int, frames: list[RawFrame]) -> int:

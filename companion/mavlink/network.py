@@ -46,6 +46,7 @@ class Network:
             [LinkPlace(name, link >= len(planner)) for link, name in enumerate(names)], filters
         )
         self._treat = treat
+        self._learned: list[set[int]] = [set() for _ in self.links]
         for number, link in enumerate(self.links):
             link.on_frames = partial(self._received, number)
 
@@ -54,13 +55,19 @@ class Network:
 
         A frame's bytes may have been changed on the way here; its header and target are read as they are now.
         """
-        destinations = self.router.destinations
+        router = self.router
+        if router.is_wire and not router.filters_out:  # nothing to choose: the usual case, and the cheapest
+            self.links[1 - source].send(
+                frames[0][0] if len(frames) == 1 else b"".join([f[0] for f in frames])
+            )
+            return len(frames)
+        destinations = router.destinations
         routed = 0
         waiting: list[bytes] = []
         waiting_for = 0
         for frame in frames:
             mask = destinations(source, frame)
-            if mask and self.router.filters_out:
+            if mask and router.filters_out:
                 mask = self._let_out(mask, frame)
             if not mask:
                 self.unrouted_frames += 1
@@ -98,8 +105,11 @@ class Network:
             if not admitted:
                 return
             frames = admitted
+        learned = self._learned[number]
         for frame in frames:
-            router.learn(number, frame)
+            _, _, system_id, component_id, verified = frame
+            if verified and (system_id << 8 | component_id) not in learned and router.learn(number, frame):
+                learned.add(system_id << 8 | component_id)
         self._treat(number, frames)
 
 

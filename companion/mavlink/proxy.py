@@ -60,7 +60,7 @@ _NAMES: Final = {
     codec.SET_POSITION_TARGET_GLOBAL_INT: "GLOBAL_INT",
 }
 _ACTIONS: Final = ("substituted", "held", "turned")
-_HEARTBEAT: Final = 0
+_TELEMETRY: Final = telemetry.MESSAGE_IDS
 _AUTOPILOT_COMPONENT: Final = 1
 _VEHICLE_SILENT_NS: Final = 5_000_000_000
 """After this another autopilot may become the one whose telemetry counts."""
@@ -217,6 +217,7 @@ class InlineProxy:
         )
         self.network = Network(planner, autopilot, self._received, filters=filters)
         """The links; its `router` knows who was heard where."""
+        self._planner_links = len(planner)
         self._handler = handler
         self._now_ns = now_ns
         self._vehicle: Heartbeat | None = None
@@ -235,10 +236,10 @@ class InlineProxy:
 
     def _received(self, link: int, frames: list[RawFrame]) -> None:
         """Take what a link received, and pass on what is left of it."""
-        if link in self.network.autopilot_links:
-            self._from_autopilot(link, frames)
-        else:
+        if link < self._planner_links:
             self._from_planner(link, frames)
+        else:
+            self._from_autopilot(link, frames)
         self.counters.unrouted_frames = self.network.unrouted_frames
 
     # ------------------------------------------------------------------ planner -> autopilot
@@ -381,27 +382,27 @@ class InlineProxy:
 
     def _from_autopilot(self, link: int, frames: list[RawFrame]) -> None:
         now_ns = self._now_ns()
-        own_ids = self._own_ids
-        if any(frame.message_id in own_ids for frame in frames):
-            frames = [
-                frame
-                for frame in frames
-                if frame.message_id not in own_ids or not self._is_for_own(frame, now_ns, from_autopilot=True)
-            ]
-            if not frames:
-                return
-        self.counters.to_planner_frames += self.network.forward(link, frames)
+        own_ids, reads, passed = self._own_ids, False, frames
         for frame in frames:
-            if frame.message_id in telemetry.MESSAGE_IDS and frame.component_id == _AUTOPILOT_COMPONENT:
-                self._telemetry(frame, now_ns)
+            if frame[1] in own_ids and self._is_for_own(frame, now_ns, from_autopilot=True):
+                passed = [other for other in passed if other is not frame]
+            reads = reads or frame[1] in _TELEMETRY
+        if not passed:
+            return
+        self.counters.to_planner_frames += self.network.forward(link, passed)
+        if reads:  # behind the sending: what the planner waits for does not wait for us
+            for frame in passed:
+                if frame[1] in _TELEMETRY and frame[3] == _AUTOPILOT_COMPONENT:
+                    self._telemetry(frame, now_ns)
 
     def _telemetry(self, frame: RawFrame, now_ns: int) -> None:
         message = telemetry.decode(frame)
         if isinstance(message, Heartbeat):
             self._heard(message, now_ns)
-        elif isinstance(message, Unusable):
+        elif type(message) is Unusable:
             self.counters.unusable_telemetry += 1
-        if self._vehicle is None or frame.system_id != self._vehicle.system_id:
+        vehicle = self._vehicle
+        if vehicle is None or frame[2] != vehicle.system_id:
             return
         try:
             self._handler.on_telemetry(message, now_ns)

@@ -121,7 +121,7 @@ class Router:
         count = len(places)
         everywhere = (1 << count) - 1
         self._autopilot_side = sum(1 << i for i, place in enumerate(places) if place.is_autopilot_side)
-        self._is_wire = count == 2 and self._autopilot_side in (1, 2)
+        self.is_wire = count == 2 and self._autopilot_side in (1, 2)
         self._others = [everywhere & ~(1 << i) for i in range(count)]
         sides = [
             self._autopilot_side if place.is_autopilot_side else everywhere & ~self._autopilot_side
@@ -136,17 +136,21 @@ class Router:
         self.filters_in = any(self._rules_in)
         self.filters_out = any(self._rules_out)
 
-    def learn(self, link: int, frame: RawFrame) -> None:
-        """Remember that a verified frame's sender is heard on a link. What may be garbage names nobody."""
+    def learn(self, link: int, frame: RawFrame) -> bool:
+        """Remember that a verified frame's sender is heard on a link; return whether it is remembered, for good.
+
+        What may be garbage names nobody.
+        """
         if not frame.verified:
-            return
+            return False
         bit = 1 << link
         key = frame.system_id << 8 | frame.component_id
         heard = self._components.get(key, 0)
-        if heard & bit or (not heard and len(self._components) >= _MOST_SENDERS):
-            return
+        if not heard and len(self._components) >= _MOST_SENDERS:
+            return False
         self._components[key] = heard | bit
         self._systems[frame.system_id] = self._systems.get(frame.system_id, 0) | bit
+        return True
 
     def admits(self, link: int, frame: RawFrame) -> bool:
         """Return whether the filters let in a frame that a link received."""
@@ -154,7 +158,7 @@ class Router:
 
     def destinations(self, link: int, frame: RawFrame) -> int:
         """Return the links to which a frame that came in on ``link`` goes, before the filters."""
-        if self._is_wire:
+        if self.is_wire:
             return self._others[link]
         if frame.message_id in _TARGETS:
             mask = self._heard_of(target_of(frame)) & self._others[link]

@@ -10,9 +10,9 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from companion.mavlink.framing import CURRENT_MODE, RawFrame
+from companion.mavlink.framing import CURRENT_MODE, HEADER_V1, HEADER_V2, MAGIC_V1, RawFrame
 
 MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
 MAV_AUTOPILOT_INVALID: Final = 8
@@ -49,8 +49,7 @@ class CurrentMode:
     custom_mode: int
 
 
-@dataclass(frozen=True, slots=True)
-class Attitude:
+class Attitude(NamedTuple):
     """ATTITUDE: Euler angles (rad) and body rates (rad/s), body FRD to local NED."""
 
     time_boot_ms: int
@@ -62,8 +61,7 @@ class Attitude:
     yawspeed: float
 
 
-@dataclass(frozen=True, slots=True)
-class AttitudeQuaternion:
+class AttitudeQuaternion(NamedTuple):
     """ATTITUDE_QUATERNION: (w, x, y, z), body FRD to local NED, of length 1 within rounding."""
 
     time_boot_ms: int
@@ -73,8 +71,7 @@ class AttitudeQuaternion:
     yawspeed: float
 
 
-@dataclass(frozen=True, slots=True)
-class LocalPosition:
+class LocalPosition(NamedTuple):
     """LOCAL_POSITION_NED: position (m) and velocity (m/s)."""
 
     time_boot_ms: int
@@ -203,17 +200,17 @@ def _current_mode(frame: RawFrame) -> CurrentMode:
 
 
 def _attitude(frame: RawFrame) -> Attitude | Unusable:
-    values = _SIX_FLOATS.unpack_from(_padded(frame, _SIX_FLOATS.size))
+    values = _fields(_SIX_FLOATS, frame)
     return Attitude(*values) if _finite(values) else Unusable(frame.message_id, "not finite")
 
 
 def _local_position(frame: RawFrame) -> LocalPosition | Unusable:
-    values = _SIX_FLOATS.unpack_from(_padded(frame, _SIX_FLOATS.size))
+    values = _fields(_SIX_FLOATS, frame)
     return LocalPosition(*values) if _finite(values) else Unusable(frame.message_id, "not finite")
 
 
 def _attitude_quaternion(frame: RawFrame) -> AttitudeQuaternion | Unusable:
-    values = _QUATERNION.unpack_from(_padded(frame, _QUATERNION.size))
+    values = _fields(_QUATERNION, frame)
     if not _finite(values):
         return Unusable(frame.message_id, "not finite")
     time_boot_ms, w, x, y, z, rollspeed, pitchspeed, yawspeed = values
@@ -248,6 +245,14 @@ def _odometry(frame: RawFrame) -> Odometry:
 def _extended_sys_state(frame: RawFrame) -> ExtendedSysState:
     payload = _padded(frame, 2)
     return ExtendedSysState(payload[0], payload[1])
+
+
+def _fields(layout: struct.Struct, frame: RawFrame) -> tuple[Any, ...]:
+    """Return the first fields of the payload, read where it stands unless MAVLink 2 has trimmed it."""
+    data = frame[0]
+    if data[1] >= layout.size:
+        return layout.unpack_from(data, HEADER_V1 if data[0] == MAGIC_V1 else HEADER_V2)
+    return layout.unpack_from(_padded(frame, layout.size))
 
 
 def _padded(frame: RawFrame, size: int) -> bytes:

@@ -1,11 +1,15 @@
 """What the process that passes MAVLink on costs: the real service on a recording, without messages and at a rate of them.
 
-    python benchmarks/service_cpu.py [--rate HZ] [--seconds S] [--rounds N] [--json]
+    python benchmarks/service_cpu.py [--rate HZ] [--seconds S] [--rounds N] [--event-loop asyncio] [--json]
 
-Loopback UDP. Of the messages a tenth are the planner's setpoints, which are decided on (armed, OFFBOARD); the rest is telemetry
+Loopback UDP. Three loads alternate in rounds, so that other load on the machine meets all of them: no messages; one message a datagram
+at the rate, which is the dearest way to send them, each wakes the process; and a flight, the simulated PX4 with the telemetry that it
+sends by default and a planner at 20 Hz, whose messages share datagrams as real ones do. The share at the rate is worked out for the flight from
+what it really sent.
+
+Of the messages at the rate a tenth are the planner's setpoints, which are decided on (armed, OFFBOARD); the rest is telemetry
 (ATTITUDE and LOCAL_POSITION_NED, one a datagram), which is read and passed on. Frames come from a folder of 320 x 240 grey PNG images at
-10 Hz; the vision worker is a process of its own and not counted. Rounds with and without messages alternate, so that other load
-on the machine meets both. Processor time is the kernel's, of every thread; "main thread" is the one that passes messages on, the
+10 Hz; the vision worker is a process of its own and not counted. Processor time is the kernel's, of every thread; "main thread" is the one that passes messages on, the
 rest decodes images, writes logs and starts workers.
 """
 
@@ -24,7 +28,10 @@ from pathlib import Path
 from pymavlink.dialects.v20 import common as mavlink
 
 from benchmarks.soak import HFOV_DEG, address, write_images
+from companion.sim.autopilot import FakeAutopilot
 from companion.sim.companion_process import CompanionProcess
+from companion.sim.planner import Planner, Waypoint
+from companion.status.client import ask
 
 SETPOINT_SHARE = 0.1
 
@@ -121,15 +128,48 @@ async def measure(pid: int, traffic: Traffic, rate_hz: float, seconds: float) ->
     return main, everything
 
 
-async def run(rate_hz: float, seconds: float, rounds: int) -> dict:
-    shares: dict[str, list[tuple[float, float]]] = {"idle": [], "at_rate": []}
-    with tempfile.TemporaryDirectory(prefix="void-cpu-") as folder:
+async def measure_flight(
+    pid: int, planner_at: tuple[str, int], autopilot_at: tuple[str, int], socket_path: Path, seconds: float
+) -> tuple[float, float, float]:
+    """Return the shares of a core of main thread and process with a simulated autopilot and a planner, and messages/s."""
+    async with FakeAutopilot(autopilot_at) as autopilot, Planner(planner_at, rate_hz=20.0) as planner:
+        await planner.wait_ready(30.0)
+        planner.aim(Waypoint(0.0, 0.0, -1.2))
+        if not autopilot.armed:
+            await planner.arm()
+        await planner.start_offboard()
+        messages = await received_messages(socket_path)
+        before, begin_s = cpu_ns(pid), time.monotonic()
+        await asyncio.sleep(seconds)
+        after, elapsed_s = cpu_ns(pid), time.monotonic() - begin_s
+        messages = await received_messages(socket_path) - messages
+    main, everything = ((a - b) / 1e9 / elapsed_s for a, b in zip(after, before, strict=True))
+    return main, everything, messages / elapsed_s
+
+
+async def received_messages(socket_path: Path) -> int:
+    status = await asyncio.to_thread(ask, socket_path, "status")
+    return sum(link["received_frames"] for link in status["links"].values())
+
+
+async def run(rate_hz: float, seconds: float, rounds: int, event_loop: str) -> dict:
+    shares: dict[str, list[tuple[float, float]]] = {
+        "idle": [],
+        "at_rate": [],
+        "flight": [],
+        "flight_at_rate": [],
+    }
+    flight_rates_hz = []
+    with tempfile.TemporaryDirectory(prefix="void-cpu-") as folder, tempfile.TemporaryDirectory() as place:
         write_images(Path(folder))
+        socket_path = Path(place) / "status.sock"
         service = CompanionProcess(
             {
                 "source": {"url": f"file:{folder}", "loop": True, "fps": 10.0},
                 "camera": {"hfov_deg": HFOV_DEG},
                 "guidance": {"view_deg": 20.0, "turn_step_deg": 20.0},
+                "status": {"socket": str(socket_path)},
+                "link": {"event_loop": event_loop},
             }
         )
         async with service:
@@ -140,8 +180,20 @@ async def run(rate_hz: float, seconds: float, rounds: int) -> dict:
                 await measure(service.pid, traffic, rate_hz, 2.0)
                 traffic.sent = traffic.came_through = 0
                 for _ in range(rounds):
-                    shares["idle"].append(await measure(service.pid, traffic, 0.0, seconds))
+                    idle = await measure(service.pid, traffic, 0.0, seconds)
+                    shares["idle"].append(idle)
                     shares["at_rate"].append(await measure(service.pid, traffic, rate_hz, seconds))
+                    *flight, flight_hz = await measure_flight(
+                        service.pid,
+                        address(started["planner"]),
+                        address(started["autopilot"]),
+                        socket_path,
+                        seconds,
+                    )
+                    flight_rates_hz.append(round(flight_hz))
+                    shares["flight"].append((flight[0], flight[1]))
+                    scaled = [a + (b - a) * rate_hz / flight_hz for a, b in zip(idle, flight, strict=True)]
+                    shares["flight_at_rate"].append((scaled[0], scaled[1]))
             finally:
                 traffic.close()
         summary = service.of("summary")[-1]
@@ -149,11 +201,12 @@ async def run(rate_hz: float, seconds: float, rounds: int) -> dict:
         "rate_hz": rate_hz,
         "rounds": rounds,
         "seconds": seconds,
-        "event_loop": "uvloop" if _has_uvloop() else "asyncio",
+        "event_loop": "uvloop" if event_loop == "auto" and _has_uvloop() else "asyncio",
         "load_average": os.getloadavg()[0],
         "messages_sent": traffic.sent,
         "datagrams_that_came_through": traffic.came_through,
         "setpoints_in": summary["setpoints_in"],
+        "flight_rates_hz": flight_rates_hz,
         **{
             f"{name}_{part}_percent": [round(100 * share[number], 2) for share in taken]
             for name, taken in shares.items()
@@ -173,17 +226,24 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=200.0)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--event-loop", choices=("auto", "asyncio"), default="auto")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    outcome = asyncio.run(run(arguments.rate, arguments.seconds, arguments.rounds))
+    outcome = asyncio.run(run(arguments.rate, arguments.seconds, arguments.rounds, arguments.event_loop))
     if arguments.json:
         print(json.dumps(outcome))
         return
-    for name, words in (("idle", "no messages"), ("at_rate", f"{arguments.rate:g} messages/s")):
+    sent_hz = statistics.median(outcome["flight_rates_hz"])
+    for name, words in (
+        ("idle", "no messages"),
+        ("at_rate", f"{arguments.rate:g} messages/s, one a datagram"),
+        ("flight", f"a flight, {sent_hz:g} messages/s"),
+        ("flight_at_rate", f"a flight, at {arguments.rate:g} messages/s"),
+    ):
         main_thread, process = (
             statistics.median(outcome[f"{name}_{part}_percent"]) for part in ("main_thread", "process")
         )
-        print(f"{words:20s} main thread {main_thread:5.2f} %, whole process {process:5.2f} % of a core")
+        print(f"{words:34s} main thread {main_thread:5.2f} %, whole process {process:5.2f} % of a core")
     print(json.dumps(outcome))
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 _RATE_WINDOW_S = 2.0
@@ -32,6 +33,39 @@ class RateMeter:
             self._times_ns.popleft()
 
 
+class Newest:
+    """The newest so many numbers, in memory that is taken at once: a service that runs for days must not grow by them.
+
+    Parameters
+    ----------
+    capacity
+        How many are kept.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._values = array("d", [0.0]) * capacity
+        self._count = 0
+
+    def append(self, value: float) -> None:
+        """Add one, in place of the oldest where there is no room."""
+        self._values[self._count % len(self._values)] = value
+        self._count += 1
+
+    def extend(self, values: Iterable[float]) -> None:
+        """Add several."""
+        for value in values:
+            self.append(value)
+
+    def __len__(self) -> int:
+        return min(self._count, len(self._values))
+
+    def __iter__(self) -> Iterator[float]:
+        """Yield them in the order in which they came."""
+        capacity = len(self._values)
+        for number in range(self._count - len(self), self._count):
+            yield self._values[number % capacity]
+
+
 def percentile(values: Iterable[float], share: float) -> float | None:
     """Return the value below which ``share`` (0-1) of the values lie (nearest rank), or None of no values."""
     ordered = sorted(values)
@@ -57,8 +91,8 @@ class RunStatistics:
         self.frames_total = 0
         self.detections: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
-        self.detection_ms: deque[float] = deque(maxlen=_KEPT_TIMES)
-        self.frame_to_setpoint_ms: deque[float] = deque(maxlen=_KEPT_TIMES)
+        self.detection_ms = Newest(_KEPT_TIMES)
+        self.frame_to_setpoint_ms = Newest(_KEPT_TIMES)
 
     def summary(self) -> dict[str, Any]:
         """Return the totals of the run."""

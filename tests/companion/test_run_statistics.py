@@ -2,7 +2,7 @@
 
 import pytest
 
-from companion.run_statistics import RateMeter, RunStatistics, percentile, percentiles
+from companion.run_statistics import Newest, RateMeter, RunStatistics, percentile, percentiles
 
 SEC = 1_000_000_000
 
@@ -31,6 +31,15 @@ def test_no_values_have_no_percentile():
 
 def test_percentiles_read_an_iterator_once_and_round():
     assert percentiles(iter([1.04, 2.06, 3.0])) == {"p50": 2.1, "p95": 3.0}
+
+
+def test_the_newest_are_kept_in_the_order_in_which_they_came():
+    newest = Newest(3)
+    assert (len(newest), list(newest)) == (0, [])
+    newest.extend([1.0, 2.0])
+    assert list(newest) == [1.0, 2.0]
+    newest.extend([3.0, 4.0, 5.0, 6.0, 7.0])
+    assert (len(newest), list(newest)) == (3, [5.0, 6.0, 7.0])
 
 
 def test_the_summary_has_the_totals():

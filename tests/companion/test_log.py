@@ -131,14 +131,17 @@ def test_other_libraries_warnings_take_the_same_way():
 
 
 def test_a_stalled_sink_never_blocks_the_caller_and_the_loss_is_announced():
-    stalled, written = threading.Event(), []
+    entered, stalled, written = threading.Event(), threading.Event(), []
 
     def sink(data: bytes) -> None:
-        assert stalled.wait(30)
+        entered.set()
+        assert stalled.wait(60)
         written.append(data.decode().rstrip())
 
     writer = LineWriter(sink, lambda lines: f"dropped {lines}", capacity=10)
-    for i in range(1000):  # returns although nothing can be written yet
+    writer.write("0")
+    assert entered.wait(60)
+    for i in range(1, 1000):  # returns although nothing can be written yet
         writer.write(str(i))
     assert writer.dropped >= 1000 - 11
     stalled.set()

@@ -84,6 +84,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands.add_parser("doctor", help="say what is missing before a flight, and what to do", add_help=False)
     commands.add_parser("calibrate", help="make or judge a camera file with a board", add_help=False)
+    commands.add_parser(
+        "tune", help="search settings against known truth or in simulated flights", add_help=False
+    )
     commands.add_parser("web", help="the page with recordings: compare settings on them", add_help=False)
     return parser
 
@@ -136,6 +139,12 @@ def _calibrate_parser() -> argparse.ArgumentParser:
     return calibrate_parser()
 
 
+def _tune_parser() -> argparse.ArgumentParser:
+    from companion.tune.command import tune_parser
+
+    return tune_parser()
+
+
 def _web_parser() -> argparse.ArgumentParser:
     from companion.web.command import web_parser
 
@@ -151,6 +160,7 @@ _OWN_PARSERS: Final[Mapping[str, Callable[[], argparse.ArgumentParser]]] = {
     "status": _status_parser,
     "record": _record_parser,
     "replay": _replay_parser,
+    "tune": _tune_parser,
     "web": _web_parser,
 }
 """Commands whose modules import much that nothing else needs."""

@@ -10,7 +10,7 @@ from typing import Final, Literal
 from companion.guidance.setpoint import LocalSetpoint, Setpoint
 from companion.mavlink import codec
 from companion.mavlink.commands import COMMAND_LONG, read_command
-from companion.mavlink.framing import Framer, RawFrame
+from companion.mavlink.framing import SIGNATURE_BYTES, Framer, RawFrame
 
 _SETPOINTS: Final = frozenset(
     {
@@ -108,7 +108,8 @@ def differences(
 
 def _key(link: int, frame: RawFrame, is_own: bool) -> tuple[object, ...]:
     if not is_own:
-        return link, frame.data
+        # A signature holds the time of day.
+        return link, frame.data[:-SIGNATURE_BYTES] if frame.is_signed else frame.data
     return link, frame.message_id, frame.system_id, frame.component_id, frame.payload
 
 

@@ -18,7 +18,7 @@ from companion.io.messages import Kind, Message
 from companion.log import Log
 from companion.mavlink.endpoint import FrameReceiver, LinkCounters
 from companion.mavlink.framing import Framer
-from companion.mavlink.signing import open_signatures
+from companion.mavlink.signing import Signatures, read_key
 from companion.replay.decisions import Decision, sent_decisions, state_decision
 
 _report: Final = TypeAdapter(DetectionReport)
@@ -75,6 +75,8 @@ class ReplayedCore:
         That it decides by.
     began_ns
         When the service began.
+    offset_ns
+        Wall time less monotonic time, for the age of signatures.
 
     Raises
     ------
@@ -82,7 +84,7 @@ class ReplayedCore:
         When it cannot be built, such as for a key that is not there.
     """
 
-    def __init__(self, config: Config, began_ns: int) -> None:
+    def __init__(self, config: Config, began_ns: int, offset_ns: int = 0) -> None:
         self._now_ns = began_ns
         self._config = config
         self._sent: list[tuple[int, bytes]] = []
@@ -98,11 +100,18 @@ class ReplayedCore:
             autopilot,
             now_ns=lambda: self._now_ns,
             began_ns=began_ns,
-            signatures=open_signatures(config.link),
+            signatures=self._signatures(offset_ns),
             apply=self._apply,
             feed=self._states,
             log=_silent_log(),
         )
+
+    def _signatures(self, offset_ns: int) -> Signatures | None:
+        link = self._config.link
+        if not link.signing_key_file:
+            return None
+        key = read_key(link.signing_key_file)
+        return Signatures(key, link_id=link.signing_link_id, unix_ns=lambda: self._now_ns + offset_ns)
 
     @property
     def state(self) -> str:

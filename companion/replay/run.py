@@ -234,7 +234,8 @@ class _Run:
         if self._other_config is not None:
             config = self._other_config.model_copy(update={"link": recorded.link, "source": recorded.source})
         self._began_ns = self._last_ns = message.time_ns
-        self._core = ReplayedCore(config, message.time_ns)
+        offset_ns = int(self._file.about.get("monotonic_to_wall_ns", "0"))
+        self._core = ReplayedCore(config, message.time_ns, offset_ns)
         self._own_component = config.link.component_id
         if self._mode == "rerun":
             self._detector = Detections(config)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.cli import main
 from companion.config import Config
@@ -17,6 +18,7 @@ from companion.errors import CompanionError
 from companion.guidance.observation import DetectionReport
 from companion.io.messages import Answer, Kind, Message
 from companion.mavlink import codec
+from companion.mavlink.signing import Signatures
 from companion.recorder.in_process import InProcessRecorder
 from companion.recorder.reading import RecordingError, RecordingFile
 from companion.recorder.sink import Recorder
@@ -298,6 +300,29 @@ def test_answers_are_compared_exactly_or_with_tolerance():
     assert not same_answer(report, replace(report, x_px=20.0), tolerant=True)
     assert not same_answer(report, replace(report, distance_m=None), tolerant=True)
     assert not same_answer(report, replace(report, kind="none", reason="blurred"), tolerant=True)
+
+
+def test_a_signature_is_no_decision_and_neither_is_a_number_of_our_own():
+    """Signatures hold the time of day; our sequence numbers count everything that we say."""
+    planner = mavlink.MAVLink(None, srcSystem=245, srcComponent=190)
+    setpoint = mavlink.MAVLink_set_position_target_local_ned_message(
+        1, 1, 1, 1, 3576, 5.0, 0.0, -1.2, 0, 0, 0, 0, 0, 0, 0, 0
+    )
+    data = bytes(setpoint.pack(planner))
+    early, late = (
+        Signatures(bytes(range(32)), link_id=1, unix_ns=lambda at=at: at * 10**18).sign(data) for at in (2, 3)
+    )
+    assert early != late
+    assert sent_decisions(1, early, 191) == sent_decisions(1, late, 191) != []
+    ours = [mavlink.MAVLink(None, srcSystem=1, srcComponent=191) for _ in range(2)]
+    ours[1].seq = 99
+    one, two = (bytes(setpoint.pack(sender)) for sender in ours)
+    assert one != two
+    assert sent_decisions(1, one, 191) == sent_decisions(1, two, 191)
+    other = mavlink.MAVLink_set_position_target_local_ned_message(
+        1, 1, 1, 1, 3576, 5.1, 0.0, -1.2, 0, 0, 0, 0, 0, 0, 0, 0
+    )
+    assert sent_decisions(1, one, 191) != sent_decisions(1, bytes(other.pack(ours[0])), 191)
 
 
 def _frame(data: bytes):

@@ -23,6 +23,7 @@ from companion.calibrate.solve import Calibration, calibrate, coverage, view_err
 from companion.cameras import write_image
 from companion.clock import RealClock
 from companion.config import LogConfig, SourceConfig
+from companion.config_overlay import replace_file
 from companion.errors import CompanionError, ConfigError, SourceError
 from companion.frames.open import open_source
 from companion.log import open_log
@@ -125,7 +126,11 @@ def make(arguments: argparse.Namespace) -> dict[str, object]:
     written = judgement.grade != "bad"
     if written:
         try:
-            path.write_text(camera_file(found, covered, judgement, shown), encoding="utf-8")
+            text = camera_file(found, covered, judgement, shown)
+            if path.is_file() or not path.exists():
+                replace_file(path, text.encode())  # a full disk must not cost the camera file that is there
+            else:
+                path.write_text(text, encoding="utf-8")
         except OSError as error:
             raise CompanionError(f"{path}: cannot be written: {error.strerror}") from error
     return {

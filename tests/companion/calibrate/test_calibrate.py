@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import json
+import resource
 import shutil
 import socket
 import threading
@@ -120,6 +121,23 @@ def test_the_command_makes_a_camera_file_that_the_detector_reads_and_judges_it(f
     assert "focal length -35" in said
     assert main(["calibrate", "--check", str(wrong)]) == 0  # nothing speaks against its figures by themselves
     assert capsys.readouterr().out.startswith("good: ")
+
+
+def test_a_full_disk_leaves_the_camera_file_that_is_there(folder, tmp_path, capsys):
+    out = tmp_path / "camera.toml"
+    out.write_text("# the good one\n")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(
+        resource.RLIMIT_FSIZE, (0, hard)
+    )  # no file may grow: what a full disk does to a program
+    try:
+        code = main(["calibrate", str(folder), "-o", str(out), "--picture", "/dev/null"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert code == 1
+    assert f"{out}: cannot be written: File too large" in capsys.readouterr().err
+    assert out.read_text() == "# the good one\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["camera.toml"]
 
 
 def test_views_from_one_place_only_are_not_called_good(folder, tmp_path, capsys):

@@ -1,6 +1,6 @@
 """Does any process of the service grow? The real service with a recording, a fake autopilot and a planner, for as long as asked.
 
-    python benchmarks/soak.py [--minutes M] [--method parallax|paper] [--metrics] [--json FILE]
+    python benchmarks/soak.py [--minutes M] [--method parallax|paper] [--metrics] [--record] [--json FILE]
 
 Frames of 320 x 240 at 10 Hz walk there and back through the footage that ships with the package, with its poses; the vehicle is
 armed and in OFFBOARD, the planner sends setpoints at 10 Hz. Every ten seconds the status is asked for, the metrics are
@@ -78,8 +78,8 @@ def endless_poses(count: int, duration_s: float) -> RecordedPoses:
     )
 
 
-def processes_below(pid: int) -> dict[int, str]:
-    """Return a process and its descendants by pid, each with its name."""
+def processes_below(pid: int, names: dict[int, str]) -> dict[int, str]:
+    """Return a process and its descendants by pid, each with the name that the status gives it."""
     found = {pid: "service"}
     parents = {}
     for folder in Path("/proc").iterdir():
@@ -94,7 +94,7 @@ def processes_below(pid: int) -> dict[int, str]:
         grown = False
         for child, parent in parents.items():
             if parent in found and child not in found:
-                found[child] = "worker" if parent == pid else "below worker"
+                found[child] = names.get(child, f"below {found[parent]}")
                 grown = True
     return found
 
@@ -128,7 +128,8 @@ def growth(samples: list[tuple[float, int]]) -> float | None:
 class Soak:
     """One run and what was seen in it."""
 
-    def __init__(self, minutes: float, method: str, *, metrics: bool) -> None:
+    def __init__(self, minutes: float, method: str, *, metrics: bool, record: bool) -> None:
+        self.record = record
         self.duration_s = 60.0 * minutes
         self.method = method
         self.metrics_port = free_port() if metrics else 0
@@ -152,6 +153,7 @@ class Soak:
                     "detector": {"method": self.method},
                     "guidance": {"view_deg": 20.0, "turn_step_deg": 20.0, "give_up_s": 3600.0},
                     "status": {"socket": str(socket_path), "metrics_port": self.metrics_port},
+                    **({"recorder": self._recorder(folder)} if self.record else {}),
                 }
             )
             async with service:
@@ -171,6 +173,10 @@ class Soak:
                 self.events = defaultdict(int)
                 for event in service.events:
                     self.events[event["event"]] += 1
+
+    def _recorder(self, folder: Path) -> dict:
+        """Return the recorder's table: small files, so that they follow each other and the oldest ones go."""
+        return {"start": "always", "folder": str(folder / "recordings"), "file_mib": 4.0, "total_mib": 64.0}
 
     async def _watch(
         self, service: CompanionProcess, planner: Planner, poses: RecordedPoses, socket_path: Path
@@ -202,7 +208,8 @@ class Soak:
             self.unanswered += 1
             print(f"{elapsed_s:7.0f} s  no status: {error}", flush=True)
         shown = []
-        for pid, name in processes_below(service.pid).items():
+        names = {use["pid"]: name for name, use in self.last_status.get("processes", {}).items()}
+        for pid, name in processes_below(service.pid, names).items():
             rss = rss_kib(pid)
             if rss is not None:
                 self.samples[(name, pid)].append((elapsed_s, rss))
@@ -270,9 +277,10 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=120.0)
     parser.add_argument("--method", choices=("parallax", "paper"), default="parallax")
     parser.add_argument("--metrics", action="store_true", help="scrape the metrics too")
+    parser.add_argument("--record", action="store_true", help="with the recorder, in the I/O process")
     parser.add_argument("--json", metavar="FILE", help="write the outcome there")
     arguments = parser.parse_args()
-    soak = Soak(arguments.minutes, arguments.method, metrics=arguments.metrics)
+    soak = Soak(arguments.minutes, arguments.method, metrics=arguments.metrics, record=arguments.record)
     asyncio.run(soak.run())
     outcome = soak.report()
     for process in outcome["processes"]:

@@ -42,7 +42,7 @@ while [ $# -gt 0 ]; do
         --wheels)
             [ $# -ge 2 ] || fail "--wheels needs a folder"
             [ -d "$2" ] || fail "--wheels: $2 is not a folder"
-            wheels="$(cd "$2" && pwd)"
+            wheels="$(cd "$2" && pwd -P)" # find does not enter a link that it is given
             shift
             ;;
         --enable) enable=yes ;;

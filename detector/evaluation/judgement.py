@@ -83,7 +83,7 @@ class Verdict:
     single_plane_truth, no_motion_truth
         What the scene is.
     near_wall_limit
-        Whether it ends within 0.3 m of the wall limit.
+        Whether the freest way ends within 0.3 m of the wall limit.
     foe_px
         Distance of the estimated focus of expansion from the true one, in the earlier frame.
     contact_frames, contact_truth_frames, contact_source, contact_error
@@ -94,6 +94,8 @@ class Verdict:
         Between the frames.
     seconds
         That the answer took.
+    wall_ahead
+        Whether nothing is free beyond the wall limit, by the free distances alone; None where they are not known, or end near the limit.
     """
 
     a: str
@@ -123,6 +125,7 @@ class Verdict:
     baseline_m: float | None
     rotation_deg: float | None
     seconds: float
+    wall_ahead: bool | None = None
 
     @property
     def is_direction(self) -> bool:
@@ -207,6 +210,7 @@ def judge(answer: Answer, pair: Pair, scene: Scene, seconds: float) -> Verdict:
         baseline_m=None if motion is None else motion.baseline_m,
         rotation_deg=None if motion is None else math.degrees(motion.rotation_rad),
         seconds=seconds,
+        wall_ahead=_wall_ahead(scene.truth),
     )
 
 
@@ -282,6 +286,11 @@ def _near_wall_limit(truth: Truth) -> bool:
     """Return whether the freest direction ends so near to the wall limit that neither answer is wrong."""
     best_m = truth.best_free_distance_m
     return best_m is not None and abs(best_m - WALL_LIMIT_M) <= _WALL_LIMIT_BAND_M
+
+
+def _wall_ahead(truth: Truth) -> bool | None:
+    best_m = truth.best_free_distance_m
+    return None if best_m is None or _near_wall_limit(truth) else best_m < WALL_LIMIT_M
 
 
 def chance_right(scene: Scene) -> float | None:

@@ -295,9 +295,7 @@ def _single_plane(verdicts: Sequence[Verdict], seed: int) -> dict[str, Any]:
     open_ = [v for v in verdicts if v.single_plane_truth is False]
     tp = sum(v.kind == SINGLE_PLANE for v in walls)
     fp = sum(v.kind == SINGLE_PLANE for v in open_)
-    clear = [
-        (v.kind == SINGLE_PLANE, v.single_plane_truth) for v in [*walls, *open_] if not v.near_wall_limit
-    ]
+    clear = [(v.kind == SINGLE_PLANE, v.wall_ahead) for v in verdicts if v.wall_ahead is not None]
     return {
         "tp": tp,
         "fp": fp,

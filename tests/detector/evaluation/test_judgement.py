@@ -67,10 +67,12 @@ def test_beside_what_is_right_by_up_to_three_degrees_is_nearly_right():
     assert verdict(at(200.0)).nearly_right is None
 
 
-def test_a_way_that_ends_within_a_hand_of_the_wall_limit_is_marked():
+def test_a_way_that_ends_near_the_wall_limit_is_neither_wall_nor_free():
     ends_m = (None, 2.6, 2.8, 3.2, 3.4)
-    found = [verdict(at(200.0), Truth(best_free_distance_m=end_m)).near_wall_limit for end_m in ends_m]
-    assert found == [False, False, True, True, False]
+    found = [verdict(at(200.0), Truth(best_free_distance_m=end_m)).wall_ahead for end_m in ends_m]
+    assert found == [None, True, None, None, False]
+    near = [verdict(at(200.0), Truth(best_free_distance_m=end_m)).near_wall_limit for end_m in ends_m]
+    assert near == [False, False, True, True, False]
 
 
 def test_a_column_at_nine_tenths_of_the_deepest_is_right():

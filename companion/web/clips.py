@@ -16,6 +16,7 @@ from companion.guidance.observation import Pose
 from companion.sim.recorded_poses import RecordedPoses
 
 VIDEO_SUFFIXES: Final = frozenset({".mp4", ".mkv", ".webm", ".avi", ".mov", ".m4v", ".mjpeg", ".mjpg"})
+MCAP_SUFFIX: Final = ".mcap"
 _POSES_NAME: Final = "poses.csv"
 _CAMERA_NAME: Final = "camera.toml"
 _RATE_HZ: Final = 10.0
@@ -53,11 +54,11 @@ class Clip(Protocol):
 
 
 def kind_of(path: Path) -> str | None:
-    """Return what a file or folder is as a recording, ``video`` or ``images``; None: none."""
+    """Return what a file or folder is as a recording, ``mcap``, ``video`` or ``images``; None: none."""
     suffix = path.suffix.lower()
     try:
         if path.is_file():
-            return "video" if suffix in VIDEO_SUFFIXES else None
+            return "mcap" if suffix == MCAP_SUFFIX else "video" if suffix in VIDEO_SUFFIXES else None
         if path.is_dir():
             if (path / TIMESTAMPS_NAME).is_file():
                 return "images"
@@ -82,6 +83,10 @@ def open_clip(path: Path) -> Clip:
             return FolderClip(path)
         case "video":
             return VideoClip(path)
+        case "mcap":
+            from companion.web.mcap_clip import McapClip  # its library is not needed for others
+
+            return McapClip(path)
         case _:
             raise SourceError(f"{path.name}: neither a recording nor a video nor a folder of images")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -118,8 +119,7 @@ class LivePage:
             )
             path = Path(web.settings_file) if web.settings_file else None
             self._settings = settings = SettingsDesk(self._config, SettingsFile(path), self._apply)
-            folder = web.recordings or self._config.recorder.folder
-            studio = Studio(Path(folder) if folder else None, lambda: settings.active, self._why_not_compare)
+            studio = Studio(_recordings(self._config), lambda: settings.active, self._why_not_compare)
             parts = Parts(self._gate, viewers, settings, studio)
             self._server = PageServer(make_application(parts), max_clients=web.max_clients)
             ready.set()
@@ -184,3 +184,14 @@ class LivePage:
         if state in _FREE_STATES:
             return ""
         return f"not while setpoints are protected ({state}): the processor is the detector's"
+
+
+def _recordings(config: Config) -> Path | None:
+    """Return the folder of recordings: the one that is named, else the recorder's, else none."""
+    if config.web.recordings:
+        return Path(config.web.recordings)
+    if config.recorder.start == "never" and not config.recorder.folder:
+        return None
+    from companion.recorder.sink import folder_of
+
+    return folder_of(config, os.environ)

@@ -19,6 +19,7 @@ export class SettingsView {
     byId("settings-discard").addEventListener("click", () => this.discard());
     byId("settings-compare").addEventListener("click", () => this.compare());
     byId("compare-close").addEventListener("click", () => byId("compare").close());
+    byId("compare").addEventListener("close", () => byId("compare-rows").replaceChildren());
     byId("compare-look").addEventListener("click", () => this.save(true));
     byId("compare-save").addEventListener("click", () => this.save(false));
     byId("settings-apply").hidden = byId("settings-undo").hidden = !isLive;

@@ -106,5 +106,5 @@ def looked_by_paper() -> list[Looked]:
 def flying(serve: Callable[..., Served], looked: list[Looked]) -> Iterator[Served]:
     """A page with a flight published to it."""
     served = serve()
-    with Showcase(served.page, served.desk, looked):
+    with Showcase(served.page, served.desk, looked, rate_hz=8.0):
         yield served

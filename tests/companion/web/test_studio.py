@@ -18,6 +18,8 @@ from companion.web.clips import open_clip
 from companion.web.studio import MOST_COMPARED, Studio, list_recordings
 from tests.companion.web.showcase import FIRST
 
+RECORDED_FLIGHT = Path(__file__).parents[2] / "data" / "recordings" / "detections.mcap"
+
 
 def noise(number: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
     return np.random.default_rng(number).integers(0, 255, (size[1], size[0]), np.uint8)
@@ -86,6 +88,31 @@ def test_any_picture_of_a_video_can_be_asked_for_in_any_order(tmp_path: Path) ->
         assert image is not None
         assert abs(float(image.mean()) - 10 * number) < 3
     clip.close()
+
+
+def test_a_recorded_flight_has_pictures_and_poses(tmp_path: Path) -> None:
+    clip = open_clip(RECORDED_FLIGHT)
+    assert len(clip.times_ns) > 5
+    assert clip.times_ns == sorted(clip.times_ns)
+    assert clip.has_poses
+    last = len(clip.times_ns) - 1
+    images = [clip.picture(number) for number in (last, 0, last)]
+    assert all(image is not None and image.ndim == 2 for image in images)
+    assert np.array_equal(images[0], images[2])
+    assert not np.array_equal(images[0], images[1])
+    pose = clip.pose(last)
+    assert pose is not None
+    assert np.linalg.norm(pose.q_ned_from_body) == pytest.approx(1.0)
+    cut = tmp_path / "cut.mcap"
+    data = RECORDED_FLIGHT.read_bytes()
+    cut.write_bytes(data[: len(data) // 2])
+    half = open_clip(cut)
+    assert 0 < len(half.times_ns) < len(clip.times_ns)
+    assert half.picture(len(half.times_ns) - 1) is not None
+    other = tmp_path / "other.mcap"
+    other.write_bytes(b"no recording")
+    with pytest.raises(SourceError, match=r"other\.mcap"):
+        open_clip(other)
 
 
 async def test_a_recording_is_opened_and_scrubbed() -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import signal
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -83,9 +86,7 @@ async def test_a_flight_in_real_time_replays_to_the_same_decisions(tmp_path):
     assert summary.is_same
     assert summary.decisions["setpoint"] > 10
     assert summary.decisions["state"] >= 3
-    file = RecordingFile(path)
-    kinds = {message.kind for message in file.messages()}
-    assert file.damage is None
+    kinds = {message.kind for message in RecordingFile(path).messages()}
     assert {Kind.FRAME, Kind.DETECTION, Kind.POSE, Kind.LOG, Kind.STATUS} <= kinds
     assert (path.with_suffix(".tlog")).stat().st_size > 1000
 
@@ -122,3 +123,22 @@ async def test_without_a_recorder_the_command_says_so(tmp_path, capsys):
         await until(socket.exists)
         assert await asyncio.to_thread(main, ["record", "start", "-s", str(socket)]) == 1
     assert 'recorder.start is "never"' in capsys.readouterr().err
+
+
+async def test_a_service_that_is_killed_leaves_a_file_that_can_be_read_and_no_process(tmp_path):
+    tables = {
+        "source": {"url": "tcp:127.0.0.1:9"},
+        "recorder": {"start": "always", "folder": str(tmp_path), "keep_free_mib": 0.0},
+    }
+    async with CompanionProcess(tables) as service:
+        started = await service.wait_for("io_started", DEADLINE_S)
+        await service.wait_for("recording_started", DEADLINE_S)
+        (path,) = tmp_path.glob("*.mcap")
+        await until(lambda: path.stat().st_size > 4_000)
+        os.kill(service.pid, signal.SIGKILL)
+        await until(lambda: not Path(f"/proc/{started['pid']}").exists())
+    file = RecordingFile(path)
+    found = [message.kind for message in file.messages()]
+    assert file.damage is not None
+    assert found[0] is Kind.CONFIG or Kind.CONFIG in found[:10]
+    assert found.count(Kind.LOOP) > 5

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
+import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from companion.errors import SourceError
@@ -19,6 +23,7 @@ from companion.recorder import topics
 from companion.recorder.reading import RecordingError, RecordingFile
 from companion.sim.recorded_poses import RecordedPoses
 
+_DAMAGE: Final = (McapError, ValueError, struct.error, EOFError, zstandard.ZstdError)
 _POSE_REACH_NS: Final = 500_000_000
 """Further from the first and last pose than this, none is known."""
 
@@ -46,6 +51,7 @@ class McapClip:
             raise SourceError(f"{path.name}: {error}") from error
         if not exposed_ns:
             raise SourceError(f"{path.name}: there are no pictures in this recording")
+        self._has_index = self._has_summary()
         self._logged_ns = [log_time for log_time, _ in self._images()]
         count = min(len(self._logged_ns), len(exposed_ns))
         self._exposed_ns = exposed_ns[:count]
@@ -81,15 +87,35 @@ class McapClip:
     def close(self) -> None:
         """Nothing is held."""
 
+    def _has_summary(self) -> bool:
+        try:
+            with self._path.open("rb") as file:
+                return make_reader(file).get_summary() is not None
+        except (*_DAMAGE, OSError):
+            return False
+
     def _images(self, at_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
         """Yield log times and data of all pictures, or of those logged at one time."""
         try:
             with self._path.open("rb") as file:
-                for _, _, message in make_reader(file).iter_messages(
-                    topics=[topics.IMAGE], starting_at=at_ns, ending_at=at_ns
-                ):
-                    yield message.log_time, message.data
-        except (McapError, OSError, ValueError, EOFError):
+                if self._has_index:
+                    reader = make_reader(file)
+                    for _, _, message in reader.iter_messages(
+                        [topics.IMAGE], starting_at=at_ns, ending_at=at_ns
+                    ):
+                        yield message.log_time, message.data
+                    return
+                channels: set[int] = set()
+                for record in StreamReader(file).records:
+                    if isinstance(record, Channel) and record.topic == topics.IMAGE:
+                        channels.add(record.id)
+                    elif (
+                        isinstance(record, Message)
+                        and record.channel_id in channels
+                        and at_ns in (None, record.log_time)
+                    ):
+                        yield record.log_time, record.data
+        except (*_DAMAGE, OSError):
             return  # cut off or damaged: what came before it can be shown
 
 

@@ -81,7 +81,7 @@ class LivePage:
         if message.kind is Kind.FRAME and message.image is not None:
             self._take_frame(message)
         elif message.kind is Kind.CONFIG and self._settings is not None:
-            self._settings.take_config(message.fields)
+            self._settings.take_config(message.fields["active"])
         with self._lock:
             self._state.take(message)
 

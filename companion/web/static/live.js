@@ -165,7 +165,7 @@ export class LiveView {
       ...names.map((name) => {
         const link = { ...known[name], ...links[name] };
         const good = link.state === "open" || link.state === "connected";
-        return make("tr", {}, make("th", { scope: "row", title: link.url || "" }, name), make("td", { class: good ? "good" : "bad" }, link.state || "–"), make("td", {}, bytes(link.received_bytes)), make("td", {}, bytes(link.sent_bytes)), make("td", {}, String((link.drops || 0) + (link.sequence_gaps || 0))));
+        return make("tr", {}, make("th", { scope: "row", title: link.url || "" }, name.replace(/^link\./, "")), make("td", { class: good ? "good" : "bad" }, link.state || "–"), make("td", {}, bytes(link.received_bytes)), make("td", {}, bytes(link.sent_bytes)), make("td", {}, String((link.drops || 0) + (link.sequence_gaps || 0))));
       }),
     );
     facts(byId("vehicle-facts"), [

@@ -115,7 +115,11 @@ class FakeDesk:
 
 
 def config_message(config: Config) -> Message:
-    return Message(Kind.CONFIG, time.monotonic_ns(), 1, config.model_dump(mode="json"))
+    tables = {
+        "active": config.model_dump(mode="json"),
+        "set": config.model_dump(mode="json", exclude_unset=True),
+    }
+    return Message(Kind.CONFIG, time.monotonic_ns(), 1, tables)
 
 
 class Showcase:

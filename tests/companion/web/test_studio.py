@@ -105,10 +105,13 @@ def test_a_recorded_flight_has_pictures_and_poses(tmp_path: Path) -> None:
     assert np.linalg.norm(pose.q_ned_from_body) == pytest.approx(1.0)
     cut = tmp_path / "cut.mcap"
     data = RECORDED_FLIGHT.read_bytes()
-    cut.write_bytes(data[: len(data) // 2])
-    half = open_clip(cut)
-    assert 0 < len(half.times_ns) < len(clip.times_ns)
-    assert half.picture(len(half.times_ns) - 1) is not None
+    cut.write_bytes(data[:-60])  # no footer, and so no index
+    rest = open_clip(cut)
+    assert rest.times_ns == clip.times_ns
+    assert np.array_equal(rest.picture(last), images[0])
+    cut.write_bytes(data[:2000])
+    with pytest.raises(SourceError, match=r"cut\.mcap: there are no pictures"):
+        open_clip(cut)
     other = tmp_path / "other.mcap"
     other.write_bytes(b"no recording")
     with pytest.raises(SourceError, match=r"other\.mcap"):

@@ -56,7 +56,7 @@ async def test_the_service_is_seen_and_tuned_and_does_not_need_the_page(tmp_path
                 else:
                     seen.update(json.loads(said)["latest"])
             assert seen["details"]["method"] == "paper"
-            assert set(seen["links"]) == {"planner", "autopilot"}
+            assert set(seen["links"]) == {"link.planner", "link.autopilot"}
         applied = await ask(port, "POST", "/api/settings/apply", {"values": {"guidance.agree_deg": 13.0}})
         assert applied["accepted"], applied
         assert applied["at_once"] == {"guidance.agree_deg": 13.0}

@@ -27,7 +27,7 @@ import sys
 import time
 import venv
 from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -68,20 +68,23 @@ SENDER = """
 import socket, sys, time
 sys.path.insert(0, sys.argv[1])
 from benchmarks.proxy import attitude
-fd, host, port, rate, seconds = int(sys.argv[2]), sys.argv[3], int(sys.argv[4]), float(sys.argv[5]), float(sys.argv[6])
-sock = socket.socket(fileno=fd)
+sock = socket.socket(fileno=int(sys.argv[2]))
+entry, rate, seconds, first = (sys.argv[3], int(sys.argv[4])), float(sys.argv[5]), float(sys.argv[6]), int(sys.argv[7])
 count = int(rate * seconds)
-first = int(sys.argv[7])
 frames = [attitude(first + i) for i in range(count)]
+sock.setblocking(True)
+print(flush=True)  # only now: packing takes longer than sending
+sys.stdin.readline()
 begin = time.perf_counter()
-sent = 0
+sent, send = 0, sock.sendto
 while sent < count:
     due = min(count, int((time.perf_counter() - begin) * rate) + 1)
-    while sent < due:
-        sock.sendto(frames[sent], (host, port))
-        sent += 1
+    for frame in frames[sent:due]:
+        send(frame, entry)
+    sent = due
     time.sleep(0.0005)
 print(time.perf_counter() - begin)
+sock.setblocking(False)
 sock.detach()
 """
 
@@ -134,7 +137,7 @@ def mixed_frames(count: int) -> list[bytes]:
 
 def open_socket() -> socket.socket:
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 32 << 20)  # as much as the kernel grants
     opened.bind(("127.0.0.1", 0))
     opened.setblocking(False)
     return opened
@@ -263,43 +266,40 @@ def measure_latency(contender: Contender, rate_hz: int, seconds: float) -> None:
 
 
 def measure_loss(contender: Contender, rate_hz: int, seconds: float) -> tuple[int, float]:
-    """Send at a rate from another process; return how many were lost, and the rate that was reached."""
+    """Send at a rate from another process; return how many were lost, and the rate that was reached.
+
+    Frames are packed before and read after: while they are under way, this process does nothing but take datagrams from the
+    kernel and the other one nothing but give them to it.
+    """
     contender.greet()
     time.sleep(0.1)
     contender.drain()
     root = str(Path(__file__).resolve().parents[1])
     vehicle, first = contender.vehicle.fileno(), contender.next_numbers()
+    numbers = map(str, (vehicle, *contender.entry, rate_hz, seconds, first))
     sender = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            SENDER,
-            root,
-            str(vehicle),
-            *map(str, contender.entry),
-            str(rate_hz),
-            str(seconds),
-            str(first),
-        ],
+        [sys.executable, "-c", SENDER, root, *numbers],
         pass_fds=[vehicle],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
-    seen: set[int] = set()
+    assert sender.stdin is not None
+    assert sender.stdout is not None
+    sender.stdout.readline()
     count = int(rate_hz * seconds)
-    quiet_since = None
-    while len(seen) < count:
-        if select.select([contender.planner], [], [], 0.2)[0]:
-            quiet_since = None
-            try:
-                while True:
-                    seen.update(n for n in numbers_in(contender.planner.recv(65535)) if n >= first)
-            except BlockingIOError:
-                continue
-        elif sender.poll() is not None:
-            quiet_since = quiet_since or time.monotonic()
-            if time.monotonic() - quiet_since > 1.5:
-                break
+    taken: list[bytes] = []
+    take, waits = contender.planner.recv, select.poll()
+    waits.register(contender.planner, select.POLLIN)
+    sender.stdin.write(b"\n")
+    sender.stdin.flush()
+    while waits.poll(1500) or sender.poll() is None:
+        with suppress(BlockingIOError):
+            while True:
+                taken.append(take(65535))
+        if len(taken) >= count and sender.poll() is not None:
+            break
     elapsed = float(sender.communicate()[0] or b"inf")
+    seen = {number for data in taken for number in numbers_in(data) if first <= number < first + count}
     return count - len(seen), count / elapsed
 
 

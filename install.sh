@@ -28,8 +28,12 @@ say() { echo "install: $*"; }
 
 systemd_runs() { [ -d /run/systemd/system ]; }
 
-# Cameras and serial ports that are there get the names that the rules of now give them.
-rename_devices() { udevadm trigger --action=change --subsystem-match=video4linux --subsystem-match=tty; }
+# Cameras and serial ports that are there get the names that the rules of now give them. Containers have no udev of their own.
+rename_devices() {
+    [ -S /run/udev/control ] || return 0
+    udevadm control --reload
+    udevadm trigger --action=change --subsystem-match=video4linux --subsystem-match=tty
+}
 
 usage() { sed -n '2,7s/^# \{0,1\}//p' "$0"; }
 
@@ -78,7 +82,6 @@ remove_everything() {
     if systemd_runs; then
         systemctl daemon-reload
         systemctl reset-failed --quiet $name.service 2>/dev/null || true # systemd has forgotten it already
-        udevadm control --reload
         rename_devices
     fi
 }
@@ -192,7 +195,6 @@ fi
 install -D -m 0644 "$here/systemd/void-companion.rules" "$rules"
 if systemd_runs; then
     systemctl daemon-reload
-    udevadm control --reload
     rename_devices
 fi
 if [ $enable = yes ]; then

@@ -31,7 +31,7 @@ _EPILOG: Final = """\
 examples
   companion tune PAIRS --trials 100 -o out                    the void map's settings, on a folder with a groundtruth.json
   companion tune WALK --truth LABELLED --min-baseline 0.25    pairs formed from poses
-  companion tune --world doorway random --seeds 1..6 -o out   in simulated flights (extra sim)
+  companion tune --world door random --seeds 1..6 -o out   in simulated flights (extra sim)
   companion tune PAIRS --search round_trip_px=0.2..2 --search flow_sigma_px
   companion tune PAIRS --storage sqlite:///tune.db            the same command again, at the same time or later, goes on with the search
 

@@ -23,13 +23,11 @@ _ENOUGH_PROFILES: Final = 4.0
 _AROUND: Final = 3
 _WIDE_RAD: Final = math.radians(6.0)
 CALIBRATION: Final = (
-    (0.15, 0.30),
-    (0.26, 0.42),
-    (0.42, 0.66),
-    (0.62, 0.73),
-    (0.78, 0.80),
-    (0.94, 0.90),
-    (1.0, 0.93),
+    (0.198, 0.341),
+    (0.328, 0.439),
+    (0.483, 0.707),
+    (0.662, 0.756),
+    (0.87, 0.852),
 )
 """Score, and the share of answers that were right there."""
 

@@ -27,6 +27,8 @@ _EDGE_SHARE: Final = 0.5
 _GRAZE_SHARE: Final = 0.2
 """Of the hidden width: what may reach in by no more is the blur of flow at the edge of a thing."""
 _FINE_RAD: Final = math.radians(0.5)
+_SURELY: Final = 2.0
+"""Standard deviations."""
 
 
 def uncovered_from_m(
@@ -144,7 +146,7 @@ def reach_in_rad(
 def _nearest(samples: RangedSamples) -> NDArray[np.float64]:
     """Return (N,) the inverse of the horizontal distance that nothing in each sample's direction is surely nearer than."""
     level = np.hypot(samples.rays_level[:, 0], samples.rays_level[:, 1])
-    return np.asarray((samples.inverse_range + 2.0 * samples.sigma) / level)
+    return np.asarray((samples.inverse_range + _SURELY * samples.sigma) / level)
 
 
 def _distances(first_m: float, most_m: float) -> list[float]:

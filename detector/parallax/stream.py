@@ -50,7 +50,7 @@ class MapReading:
     remembered
         What the last pairs say together, from this place.
     surely
-        What may be flown: no further than it was looked through (:mod:`detector.parallax.sure_map`).
+        What may be flown: with what was seen near before, and short in a plain scene (:mod:`detector.parallax.sure_map`).
     gap
         The answer from it; None where it is another.
     confidence

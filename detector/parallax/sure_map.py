@@ -1,13 +1,15 @@
-"""What of the map may be flown: beside the map that answers, one of what was really looked through.
+"""What of the map may be flown: what was seen near is still there when it shows no longer, and steps are short where nothing was looked through.
 
 The furthest direction is chosen on the whole map: ways with a gap between their samples are mostly free. But something near could stand in such a gap
-(a smooth pillar, the plain end of a wall), and what was seen there before is no longer measured when it comes near the edge of the picture. So a way counts
-no further than it was looked through, and where a profile did not look through a direction, one that did is remembered.
+(a smooth pillar, the plain end of a wall), and what was seen there before is no longer measured when it comes near the edge of the picture. So near things are remembered
+until a pair looks through the place where they stood. And where most of the picture is plain, no direction is flown further than it was looked through: there, what stands in a gap
+shows nowhere else either.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +17,16 @@ from numpy.typing import NDArray
 from detector.parallax.coverage import uncovered_from_m
 from detector.parallax.map_memory import MapMemory, MapMemoryParams
 from detector.parallax.samples import RangedSamples
-from detector.parallax.void_map import BINS, VoidMap, VoidMapParams
+from detector.parallax.void_map import BINS, VoidMap, VoidMapParams, bin_of
+
+_AGREE: Final = 1.25
+"""What is remembered as near must not be much nearer than the last pairs say together: one of them may be wild."""
+_SURE_SHARE: Final = 0.25
+"""Of its distance: what is known less well is not remembered as near."""
 
 
 class SureMap:
-    """Remembers the profiles of what was looked through; all in one local frame, in metres.
+    """Remembers what was seen near; all in one local frame, in metres.
 
     Parameters
     ----------
@@ -52,31 +59,43 @@ class SureMap:
         measured, samples
             The map of the pair and what it was made from.
         remembered
-            What the last pairs say together, gaps or no gaps.
+            What the last pairs say together.
         position_m, time_s
             As :meth:`detector.parallax.map_memory.MapMemory.add` takes them.
 
         Returns
         -------
-        In view, the whole map's distance, but no further than this pair looked through the direction, or an earlier one did: what that saw there counts
-        until it is looked through again. Out of view, what was looked through. A limit has the distance's uncertainty added, for that is taken off again before a
-        way is flown.
+        The remembered map, shortened to what was seen near there before and not looked through since; and in view, where the picture is plain, to what this pair looked through.
+        To that limit the distance's uncertainty is added, for it is taken off again before a way is flown.
         """
-        limit_m = looked_through_m(samples, self._params)
-        self._memory.add(measured.where(measured.free_m <= limit_m), position_m, time_s)
-        before = self._memory.remembered(position_m, time_s).found
+        looked_m = looked_through_m(samples, self._params)
+        is_near = measured.free_m <= np.minimum(looked_m, self._params.covered_m)
+        is_near &= measured.sigma_m <= _SURE_SHARE * (measured.free_m + self._params.radius_m)
+        is_near &= remembered.free_m <= _AGREE * measured.free_m
+        self._memory.add(measured.where(is_near), position_m, time_s)
+        near = self._memory.remembered(position_m, time_s).found
+
         in_view = remembered.known & measured.known
         sigma_m = np.where(remembered.known, remembered.sigma_m, 0.0)
-        sure_m = np.where(before.known, before.free_m - before.sigma_m, -np.inf)
-        whole = in_view & (remembered.free_m - sigma_m <= np.maximum(sure_m, limit_m))
-        limited = in_view & ~whole & (sure_m < limit_m)
+        most_m = looked_m if self._is_plain(measured, samples) else np.full(BINS, np.inf)
+        shortened = np.where(in_view, np.minimum(remembered.free_m, most_m + sigma_m), remembered.free_m)
+        refuted = in_view & (looked_m > near.free_m)
+        low_m = np.where(remembered.known, shortened - sigma_m, np.inf)
+        stands = near.known & ~refuted & (near.free_m - np.where(near.known, near.sigma_m, 0.0) < low_m)
         return VoidMap(
-            before.azimuth_rad,
-            np.where(whole, remembered.free_m, np.where(limited, limit_m + sigma_m, before.free_m)),
-            np.where(whole | limited, remembered.count, before.count),
-            np.where(whole | limited, remembered.sigma_m, before.sigma_m),
-            np.asarray(before.known | in_view, np.bool_),
+            remembered.azimuth_rad,
+            np.where(stands, near.free_m, shortened),
+            np.where(stands, near.count, remembered.count),
+            np.where(stands, near.sigma_m, remembered.sigma_m),
+            np.asarray(remembered.known | stands, np.bool_),
         )
+
+    def _is_plain(self, measured: VoidMap, samples: RangedSamples) -> bool:
+        """Return whether less than the wanted share of the directions in the picture is known."""
+        rays = samples.rays_level
+        level = np.abs(rays[:, 2]) <= math.sin(math.radians(self._params.known_elevation_deg))
+        seen = np.unique(bin_of(np.arctan2(rays[level, 1], rays[level, 0])))
+        return seen.size > 0 and float(measured.known[seen].mean()) < self._params.plain_share
 
 
 def looked_through_m(samples: RangedSamples, params: VoidMapParams) -> NDArray[np.float64]:

@@ -96,7 +96,7 @@ class VoidMapParams(BaseModel):
         Field(
             gt=0,
             le=5,
-            description="A way is flown no further than to where something so wide could stand in it between the samples, unseen. Larger: bolder where there is little texture.",
+            description="A way was looked through up to where something so wide could stand in it between the samples, unseen. Larger: bolder where there is little texture.",
         ),
     ] = 0.3
     covered_m: Annotated[
@@ -107,6 +107,14 @@ class VoidMapParams(BaseModel):
             description="How far ahead that is asked (m); 0 asks it nowhere. Larger: shorter ways where there is little texture.",
         ),
     ] = 2.0
+    plain_share: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1,
+            description="Where less than this share of the directions in the picture is known, no way is flown further than it was looked through. Larger: more careful where there is little texture; 0: never.",
+        ),
+    ] = 0.6
     plateau: Annotated[
         float,
         Field(

@@ -1,4 +1,4 @@
-"""A way counts no further than it was looked through, and what did look through it is remembered."""
+"""What was seen near is still there when it shows no longer; in a plain scene a way counts no further than it was looked through."""
 
 from __future__ import annotations
 
@@ -52,16 +52,46 @@ def test_a_near_thing_that_shows_no_longer_is_still_there() -> None:
     assert surely.free_m[ahead] == pytest.approx(1.4 - PARAMS.radius_m, abs=0.15)
 
 
-def test_a_hole_that_nobody_looked_through_ends_the_way_there() -> None:
-    whole, surely = Flight().take(with_a_hole())
-    limit_m = looked_through_m(with_a_hole(), PARAMS)
-    ahead, aside = whole.at(0.0), whole.at(math.radians(28.0))
-    assert whole.free_m[ahead] > 3.0
-    assert surely.known[ahead]
-    assert limit_m[ahead] < 2.0 - PARAMS.radius_m
+def plain_room() -> RangedSamples:
+    """What is seen of a room with plain walls: samples on either side of a wide plain place ahead, and nothing to the left."""
+    return looking((np.abs(azimuth_deg() - 8.0) > 6.5) & (azimuth_deg() > -8.0) & (azimuth_deg() < 24.0))
+
+
+def test_in_a_plain_scene_a_way_ends_where_something_could_stand_in_it() -> None:
+    samples = plain_room()
+    whole, surely = Flight().take(samples)
+    looked_m, ahead = looked_through_m(samples, PARAMS), whole.at(math.radians(8.0))
+    assert whole.free_m[ahead] > 3.0, "bridged"
+    assert looked_m[ahead] < 1.5
     # The spread is taken off by who flies it, so it is not taken off here.
-    assert surely.free_m[ahead] - surely.sigma_m[ahead] <= limit_m[ahead] + 1e-9
-    assert surely.free_m[aside] == whole.free_m[aside]
+    assert surely.free_m[ahead] - surely.sigma_m[ahead] == pytest.approx(looked_m[ahead])
+    bold, as_the_map_says = Flight(VoidMapParams(plain_share=0.0)).take(samples)
+    np.testing.assert_array_equal(as_the_map_says.free_m, bold.free_m)
+
+
+def test_where_most_is_known_a_gap_between_samples_ends_nothing() -> None:
+    whole, surely = Flight().take(with_a_hole())
+    ahead = whole.at(0.0)
+    assert looked_through_m(with_a_hole(), PARAMS)[ahead] < 1.5
+    assert surely.free_m[ahead] == whole.free_m[ahead] > 3.0
+
+
+def test_a_near_thing_is_gone_when_its_place_is_looked_through() -> None:
+    flight = Flight()
+    flight.take(looking(None, np.where(np.abs(azimuth_deg()) <= 7.0, 1.4, FAR_M)))
+    for _ in range(6):
+        whole, surely = flight.take(looking())
+    ahead = np.abs(np.degrees(whole.azimuth_rad)) < 15.0
+    np.testing.assert_array_equal(surely.free_m[ahead], whole.free_m[ahead])
+
+
+def test_one_wild_pair_makes_no_near_thing() -> None:
+    flight = Flight()
+    for _ in range(4):
+        flight.take(looking())
+    flight.take(looking(None, np.where(np.abs(azimuth_deg()) <= 7.0, 1.4, FAR_M)))
+    whole, surely = flight.take(with_a_hole())
+    assert surely.free_m[whole.at(0.0)] > 3.0
 
 
 def test_what_is_looked_through_everywhere_is_flown_as_the_map_says() -> None:

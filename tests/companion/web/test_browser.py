@@ -147,7 +147,7 @@ def test_layers_are_switched(serve: Callable[..., Served], looked: list[Looked],
         page = open_page(served)
         wait_for_pictures(page)
         wait_for(page, "document.querySelector('#answer-words').textContent.startsWith('gap')")
-        for name in ("Direction", "Void map", "Ranges", "Focus of expansion"):
+        for name in ("Direction", "Void map", "Ranges"):
             box = page.get_by_role("checkbox", name=name)
             before = pixels(page)
             box.set_checked(not box.is_checked())

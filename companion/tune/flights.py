@@ -21,7 +21,7 @@ from companion.sim.suite_worlds import world_of
 from companion.tune.cases import Part, held_out_count
 from companion.tune.errors import TrialError, TuneError
 from companion.tune.score import flight_scores
-from companion.tune.space import Settings, Value
+from companion.tune.space import Settings
 
 PARAMS_FILE: Final = "params.toml"
 
@@ -74,7 +74,7 @@ class Flights:
             world = world_of(flight)
             self._limits_s[flight.name] = flight.spec.rules_for(place_in(world)).time_limit_s
             self._reachable[flight.name] = world.goal_reachable
-        self._fly_all = fly_all
+        self._fly_all, self._template = fly_all, template
 
     def count(self, part: Part) -> int:
         """Return how many flights there are."""
@@ -91,7 +91,7 @@ class Flights:
             The configuration does not allow these settings together, or a simulation failed.
         """
         with tempfile.TemporaryDirectory(prefix="tune-") as name:
-            tables = tables_with(settings, Path(name))
+            tables = tables_with(settings, Path(name), self._template)
             try:
                 config_of(tables, name="settings")
             except CompanionError as error:
@@ -125,18 +125,30 @@ class Flights:
         }
 
 
-def tables_with(settings: Settings, folder: Path) -> dict[str, dict[str, Value]]:
-    """Return settings as tables of the configuration; the method's own parameters go into a file in this folder."""
-    tables: dict[str, dict[str, Value]] = {}
+def tables_with(settings: Settings, folder: Path, template: FlightSpec) -> dict[str, dict[str, Any]]:
+    """Return settings as tables of the configuration, over those of the flights.
+
+    Parameters
+    ----------
+    settings
+        What is tried.
+    folder
+        The method's own parameters go into a file in there.
+    template
+        Of the flights: its method and settings.
+    """
+    tables: dict[str, dict[str, Any]] = {"detector": {"method": template.method}}
+    for name, table in template.settings.items():
+        tables.setdefault(name, {}).update(table)
     params = {name: value for name, value in settings.items() if "." not in name}
     for name, value in settings.items():
-        table, dot, key = name.partition(".")
+        table_name, dot, key = name.partition(".")
         if dot:
-            tables.setdefault(table, {})[key] = value
+            tables.setdefault(table_name, {})[key] = value
     if params:
         file = folder / PARAMS_FILE
         file.write_text(params_toml(params), encoding="utf-8")
-        tables.setdefault("detector", {})["params_file"] = str(file)
+        tables["detector"]["params_file"] = str(file)
     return tables
 
 

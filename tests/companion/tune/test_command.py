@@ -18,7 +18,7 @@ from companion.config_sources import ConfigPlaces, load
 from companion.sim.suite import Ending
 from companion.tune.command import _ended_like_ctrl_c
 from companion.tune.errors import TrialError
-from companion.tune.flights import Flights
+from companion.tune.flights import Flights, tables_with
 from companion.tune.pairs import TruePairs, load_pairs
 from companion.vision.child import build_pipeline
 
@@ -128,6 +128,18 @@ def test_flights_are_flown_with_the_settings_and_a_collision_counts_first():
     assert near > far > 0.5 > hit
     assert len(fly.tables) == 9
     assert not Path(fly.tables[0]["detector"]["params_file"]).exists()
+
+
+def test_what_all_flights_have_goes_with_what_is_tried(tmp_path):
+    from companion.sim.flight import FlightSpec
+
+    template = FlightSpec(method="paper", settings={"detector": {"preset": "paper"}})
+    tried = {"guidance.max_step_m": 0.4, "min_features": 70}
+    assert tables_with(tried, tmp_path, template) == {
+        "detector": {"method": "paper", "preset": "paper", "params_file": str(tmp_path / "params.toml")},
+        "guidance": {"max_step_m": 0.4},
+    }
+    assert (tmp_path / "params.toml").read_text() == "min_features = 70\n"
 
 
 def test_a_flight_that_cannot_be_simulated_is_a_trial_without_a_value():

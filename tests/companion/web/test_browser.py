@@ -1,4 +1,4 @@
-"""The page in a real browser. With VOID_COMPANION_SCREENSHOTS=1 it also makes the pictures of docs/web.md."""
+"""The page in a real browser. With VOID_SCREENSHOTS=1 it also makes the pictures of docs/web.md."""
 
 from __future__ import annotations
 
@@ -101,8 +101,11 @@ def pixels(page: Page, canvas: str = "#picture") -> str:
 
 def shot(page: Page, name: str, *, full_page: bool = False) -> None:
     """Write a picture for the documentation, where that is asked for."""
-    if os.environ.get("VOID_COMPANION_SCREENSHOTS") != "1":
+    if os.environ.get("VOID_SCREENSHOTS") != "1":
         return
+    page.evaluate("scrollTo(0, 0)")
+    if page.locator("#view-live").is_visible():
+        wait_for(page, "!document.querySelector('#picture').classList.contains('stale')")
     data = page.screenshot(full_page=full_page)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None

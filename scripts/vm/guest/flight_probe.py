@@ -113,11 +113,11 @@ async def fly(node: str) -> None:
         await slow_down(autopilot)
         tables["link"] = {"autopilot": "udpout:{}:{}".format(*autopilot.address)}
         async with CompanionProcess(tables, on_event=on_event) as service:
-            started = await service.wait_for("service_started", 240.0)
+            started = await service.wait_for("service_started", 900.0)
             host, _, port = started["planner"].rpartition(":")
             async with Planner((host, int(port)), rate_hz=5.0, keep_frames=True) as planner:
-                await service.wait_for("worker_ready", 300.0)
-                await planner.wait_ready(60.0)
+                await service.wait_for("worker_ready", 600.0)
+                await planner.wait_ready(300.0)
                 first, first_down = len(planner.sent_frames), len(autopilot.sent_frames)
                 planner.aim(Waypoint(5.0, 0.0, -1.2))
                 await patiently(planner.arm)

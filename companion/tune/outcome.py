@@ -145,7 +145,7 @@ def markdown(outcome: Outcome, files: Sequence[str]) -> str:
     lines = [
         "# Search for settings",
         "",
-        f"{outcome.trials} trials, the best is number {outcome.best_trial}.",
+        f"Finished trials: {outcome.trials}; the best is number {outcome.best_trial}.",
         "",
     ]
     if (warning := warning_of(outcome)) is not None:

@@ -16,7 +16,7 @@ from typing import Any, Self
 
 from companion.errors import CompanionError
 
-_STOP_S = 5.0
+_STOP_S = 20.0
 _LAST_LINES = 20
 
 Event = dict[str, Any]

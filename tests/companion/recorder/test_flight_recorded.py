@@ -125,6 +125,13 @@ async def test_without_a_recorder_the_command_says_so(tmp_path, capsys):
     assert 'recorder.start is "never"' in capsys.readouterr().err
 
 
+def kinds_in(path: Path) -> list[Kind]:
+    file = RecordingFile(path)
+    found = [message.kind for message in file.messages()] if path.stat().st_size > 1000 else []
+    assert file.damage is not None or not found  # nobody has finished it
+    return found
+
+
 async def test_a_service_that_is_killed_leaves_a_file_that_can_be_read_and_no_process(tmp_path):
     tables = {
         "source": {"url": "tcp:127.0.0.1:9"},
@@ -134,11 +141,9 @@ async def test_a_service_that_is_killed_leaves_a_file_that_can_be_read_and_no_pr
         started = await service.wait_for("io_started", DEADLINE_S)
         await service.wait_for("recording_started", DEADLINE_S)
         (path,) = tmp_path.glob("*.mcap")
-        await until(lambda: path.stat().st_size > 4_000)
+        await until(lambda: len(kinds_in(path)) > 50)  # what is not finished can be read, too
         os.kill(service.pid, signal.SIGKILL)
         await until(lambda: not Path(f"/proc/{started['pid']}").exists())
-    file = RecordingFile(path)
-    found = [message.kind for message in file.messages()]
-    assert file.damage is not None
-    assert found[0] is Kind.CONFIG or Kind.CONFIG in found[:10]
-    assert found.count(Kind.LOOP) > 5
+    found = kinds_in(path)
+    assert len(found) > 50
+    assert {Kind.CONFIG, Kind.LOG, Kind.LOOP} <= set(found)

@@ -99,7 +99,7 @@ class FlightSpec:
     frame_drop_rate: float = 0.0
     frame_latency_s: float = 0.0
     frame_jitter_s: float = 0.0
-    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):

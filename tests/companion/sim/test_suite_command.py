@@ -82,7 +82,9 @@ def processes_with(text: str) -> set[int]:
 def test_an_interrupted_suite_leaves_nothing_behind_and_says_how_to_go_on(tmp_path, number):
     places = tmp_path / "temporary"
     places.mkdir()
-    words = [sys.executable, "-m", "companion", *suite(tmp_path, "--seeds", "1..9", "-j", "2")]
+    # What runs in a shell's background inherits an ignored SIGINT; a user's terminal does not do that.
+    words = ["env", "--default-signal=INT", sys.executable, "-m", "companion"]
+    words += suite(tmp_path, "--seeds", "1..9", "-j", "2")
     process = subprocess.Popen(
         words, env={**os.environ, "TMPDIR": str(places)}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
     )

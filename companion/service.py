@@ -30,7 +30,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from companion.clock import Clock
+from companion.clock import Clock, RealClock
 from companion.config import Config
 from companion.config_sources import ConfigPlaces
 from companion.core import Core
@@ -71,6 +71,8 @@ _HEALTH_LATE_NS: Final = 1_000_000_000
 """Health that has not run for this long means that this process does not work: no HEARTBEAT then."""
 _RATE_BACK: Final = 1.2
 """A frame rate that fell below the floor counts as back at this multiple of it: one at the floor must not flap."""
+_LATE_SETPOINT_S: Final = 0.25
+"""Setpoints that waited longer for this process are dropped. Planners send several in that time, and the newest passes."""
 _REOPEN_DELAYS_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 
 
@@ -177,8 +179,14 @@ class Service:
         """
         config, clock, log = self._config, self._clock, self._log
         async with AsyncExitStack() as stack:
-            planner = make_side("planner", config.link.planner_urls, now_ns=clock.now_ns)
-            autopilot = make_side("autopilot", config.link.autopilot_urls, now_ns=clock.now_ns)
+            # The kernel stamps arrivals by real time; to a simulated clock they say nothing.
+            make = partial(
+                make_side,
+                now_ns=clock.now_ns,
+                late_after_s=_LATE_SETPOINT_S if isinstance(clock, RealClock) else None,
+            )
+            planner = make("planner", config.link.planner_urls)
+            autopilot = make("autopilot", config.link.autopilot_urls)
             for link in (*planner, *autopilot):
                 link.on_state = self._on_link_state
                 await stack.enter_async_context(link)

@@ -39,6 +39,8 @@ class LinkCounters:
         Datagrams to send while no peer was known or the endpoint was not open.
     filtered_frames
         Frames that a filter kept back, in either direction.
+    late_setpoints
+        Setpoints that had waited here too long to be passed on.
     socket_errors
         Errors that the kernel reported later (nobody listens there); the endpoint goes on.
     refused_peers
@@ -56,6 +58,7 @@ class LinkCounters:
     send_drops: int = 0
     unheard_datagrams: int = 0
     filtered_frames: int = 0
+    late_setpoints: int = 0
     socket_errors: int = 0
     refused_peers: int = 0
     opened: int = 0
@@ -148,6 +151,7 @@ class Endpoint(ABC):
             "sequence_gaps": counters.sequence_gaps,
             "drops": counters.send_drops,
             "filtered": counters.filtered_frames,
+            "late_setpoints": counters.late_setpoints,
             "opened": counters.opened,
         }
 

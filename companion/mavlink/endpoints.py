@@ -12,7 +12,13 @@ from companion.mavlink.link import UdpEndpoint
 from companion.mavlink.network import side_names
 
 
-def make_endpoint(url: str, *, name: str = "link", now_ns: Callable[[], int] = time.monotonic_ns) -> Endpoint:
+def make_endpoint(
+    url: str,
+    *,
+    name: str = "link",
+    now_ns: Callable[[], int] = time.monotonic_ns,
+    late_after_s: float | None = None,
+) -> Endpoint:
     """Return the endpoint that a URL names; ``async with`` opens it.
 
     Parameters
@@ -23,6 +29,8 @@ def make_endpoint(url: str, *, name: str = "link", now_ns: Callable[[], int] = t
         How status and errors call it.
     now_ns
         Monotonic time.
+    late_after_s
+        As of `UdpEndpoint`; the kernel keeps no such time for TCP and serial lines.
 
     Raises
     ------
@@ -35,7 +43,7 @@ def make_endpoint(url: str, *, name: str = "link", now_ns: Callable[[], int] = t
         raise LinkError(f"{name}: cannot read {url!r}; expected {error}") from error
     match kind:
         case "udpin" | "udpout":
-            return UdpEndpoint(url, name=name, now_ns=now_ns)
+            return UdpEndpoint(url, name=name, now_ns=now_ns, late_after_s=late_after_s)
         case "tcp":
             from companion.mavlink.tcp import TcpEndpoint
 
@@ -51,7 +59,11 @@ def make_endpoint(url: str, *, name: str = "link", now_ns: Callable[[], int] = t
 
 
 def make_side(
-    side: str, urls: Sequence[str], *, now_ns: Callable[[], int] = time.monotonic_ns
+    side: str,
+    urls: Sequence[str],
+    *,
+    now_ns: Callable[[], int] = time.monotonic_ns,
+    late_after_s: float | None = None,
 ) -> tuple[Endpoint, ...]:
     """Return the endpoints of one side, ``planner`` or ``autopilot``, named as the filters name them.
 
@@ -62,5 +74,6 @@ def make_side(
     """
     names = side_names(side, len(urls))
     return tuple(
-        make_endpoint(url, name=f"link.{name}", now_ns=now_ns) for url, name in zip(urls, names, strict=True)
+        make_endpoint(url, name=f"link.{name}", now_ns=now_ns, late_after_s=late_after_s)
+        for url, name in zip(urls, names, strict=True)
     )

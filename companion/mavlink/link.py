@@ -18,8 +18,10 @@ from typing import Final, Self
 
 from companion.config.endpoint_url import parse_endpoint_url
 from companion.errors import LinkError
+from companion.mavlink import codec
+from companion.mavlink.arrival import DatagramWait, datagram_wait
 from companion.mavlink.endpoint import Endpoint, FrameReceiver, LinkCounters, reopen_delay_s
-from companion.mavlink.framing import Framer, FramingCounters
+from companion.mavlink.framing import Framer, FramingCounters, RawFrame
 
 __all__ = ["Address", "FrameReceiver", "LinkCounters", "UdpEndpoint"]
 
@@ -37,6 +39,9 @@ ever there, costs a tenth of what the one that came did. One that is there after
 _NEVER_NS: Final = 1 << 62
 _SILENT_NS: Final = 5_000_000_000
 """A host called by its name that is silent for so long is looked up again: it may have moved."""
+_SETPOINTS: Final = frozenset(
+    {codec.SET_ATTITUDE_TARGET, codec.SET_POSITION_TARGET_LOCAL_NED, codec.SET_POSITION_TARGET_GLOBAL_INT}
+)
 _ADDRESS_LOST: Final = frozenset(
     {errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EADDRNOTAVAIL, errno.EINVAL, errno.ENODEV}
 )
@@ -73,6 +78,9 @@ class UdpEndpoint(Endpoint):
         gives way to a new one.
     now_ns
         Monotonic time; used only to forget silent peers.
+    late_after_s
+        Setpoints that waited longer than this in the kernel, because this process was held up, are dropped and counted:
+        answered now, an old wish would look new. Other frames go on however late. None: nothing is late.
 
     Raises
     ------
@@ -88,6 +96,7 @@ class UdpEndpoint(Endpoint):
         peer_timeout_s: float = 60.0,
         max_peers: int = 16,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        late_after_s: float | None = None,
     ) -> None:
         super().__init__(url, name)
         try:
@@ -101,6 +110,8 @@ class UdpEndpoint(Endpoint):
         self._peer_timeout_ns = int(peer_timeout_s * 1e9)
         self._max_peers = max_peers
         self._now_ns = now_ns
+        self._late_after_ns = None if late_after_s is None else int(late_after_s * 1e9)
+        self._waited_ns: DatagramWait = _no_wait
         self._socket: socket.socket | None = None
         self._peers: dict[Address, _Peer] = {}
         self._addresses: tuple[Address, ...] = ()
@@ -172,6 +183,8 @@ class UdpEndpoint(Endpoint):
             raise
         self._close()
         self._socket = opened
+        if self._late_after_ns is not None:
+            self._waited_ns = datagram_wait(opened)
         if not self._listens:
             self._peers = {address: _Peer(self.counters.framing, self._now_ns())}
             self._peers[address].has_sent_frames = True  # sent to from the start
@@ -307,6 +320,11 @@ class UdpEndpoint(Endpoint):
             else:
                 peer.heard_ns = now_ns
                 frames = peer.framer.feed(bytes(view[:size]))
+                if self._late_after_ns is not None:
+                    for frame in frames:
+                        if frame[1] in _SETPOINTS:
+                            frames = self._in_time(frames, self._late_after_ns)
+                            break
                 if frames:
                     if not peer.has_sent_frames:
                         peer.has_sent_frames = True
@@ -314,6 +332,14 @@ class UdpEndpoint(Endpoint):
                     self._deliver(frames)
             if not is_burst:
                 return
+
+    def _in_time(self, frames: list[RawFrame], late_after_ns: int) -> list[RawFrame]:
+        """Return the frames of the datagram just read, without its setpoints where it waited too long."""
+        if self._waited_ns() <= late_after_ns:
+            return frames
+        left = [frame for frame in frames if frame.message_id not in _SETPOINTS]
+        self.counters.late_setpoints += len(frames) - len(left)
+        return left
 
     def _admit(self, address: Address) -> _Peer | None:
         """Return a new peer, or None where there are too many."""
@@ -341,6 +367,10 @@ class UdpEndpoint(Endpoint):
         self._addresses = tuple(address for address, peer in self._peers.items() if peer.has_sent_frames)
         heard_ns = min((peer.heard_ns for peer in self._peers.values()), default=_NEVER_NS)
         self._forget_due_ns = heard_ns + self._peer_timeout_ns
+
+
+def _no_wait() -> int:
+    return 0
 
 
 def _is_number(host: str) -> bool:

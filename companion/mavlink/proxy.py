@@ -432,4 +432,5 @@ def _link_counts(links: Sequence[LinkCounters]) -> dict[str, int]:
         "garbage_bytes": sum(link.framing.garbage_bytes for link in links),
         "crc_errors": sum(link.framing.crc_errors for link in links),
         "send_drops": sum(link.send_drops for link in links),
+        "late_setpoints": sum(link.late_setpoints for link in links),
     }

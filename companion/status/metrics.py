@@ -29,6 +29,7 @@ _LINK_COUNTERS: Final = (
     ("sequence_gaps", "lost_frames", "Frames lost before they came here, by their sequence numbers."),
     ("drops", "send_drops", "Datagrams that the kernel did not take."),
     ("filtered", "filtered_frames", "Frames that a filter kept back."),
+    ("late_setpoints", "late_setpoints", "Setpoints that had waited here too long, and were dropped."),
     ("opened", "opened", "Times that the link was opened."),
 )
 

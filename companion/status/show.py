@@ -125,7 +125,7 @@ def _links(links: Mapping[str, Mapping[str, Any]]) -> list[str]:
             "link" if number == 0 else "",
             f"{name}  {link['url']}  {link['state']}, {link['peers']} peers, in {_bytes(link['received_bytes'])}, "
             f"out {_bytes(link['sent_bytes'])}, {link['crc_errors']} checksum errors, {link['sequence_gaps']} lost, "
-            f"{link['drops']} not taken",
+            f"{link['drops']} not taken, {link['late_setpoints']} setpoints too late",
         )
         for number, (name, link) in enumerate(links.items())
     ]

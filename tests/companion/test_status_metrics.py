@@ -64,6 +64,7 @@ STATUS = {
             "sequence_gaps": 0,
             "drops": 0,
             "filtered": 0,
+            "late_setpoints": 0,
             "opened": 1,
         }
     },

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import socket
+import time
 from collections.abc import Callable
 
 import pytest
@@ -180,3 +181,55 @@ async def test_the_same_port_can_be_opened_again_at_once():
         port = first.local_address[1]
     async with UdpEndpoint(f"udpin:127.0.0.1:{port}") as again:
         assert again.local_address[1] == port
+
+
+def setpoint(x: float) -> bytes:
+    message = common.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, 0b110111111000, x, 0, -1, 0, 0, 0, 0, 0, 0, 0, 0
+    )
+    return bytes(message.pack(SENDER))
+
+
+async def test_a_setpoint_that_waited_while_the_process_was_held_up_is_dropped_and_the_rest_of_it_passes():
+    async with UdpEndpoint("udpin:127.0.0.1:0", late_after_s=0.1) as endpoint:
+        got = []
+        with udp_socket(endpoint.local_address) as planner:
+            while (
+                not endpoint.counters.late_setpoints
+            ):  # the kernel begins to stamp a moment after it was asked to
+                received = endpoint.counters.received_datagrams
+                planner.send(setpoint(0.0))
+                time.sleep(0.15)  # noqa: ASYNC251  as below
+                await until(lambda: endpoint.counters.received_datagrams > received)  # noqa: B023  it ends in here
+            endpoint.on_frames = got.append
+            before = endpoint.counters.late_setpoints, endpoint.counters.received_datagrams
+            planner.send(HEARTBEAT + setpoint(1.0) + ATTITUDE)
+            planner.send(setpoint(2.0))
+            planner.send(ATTITUDE)
+            time.sleep(0.3)  # noqa: ASYNC251  the loop is held up: that is the test
+            await until(lambda: endpoint.counters.received_datagrams == before[1] + 3)
+    assert [[frame.data for frame in frames] for frames in got] == [[HEARTBEAT, ATTITUDE], [ATTITUDE]]
+    assert endpoint.counters.late_setpoints == before[0] + 2
+    assert endpoint.status()["late_setpoints"] == before[0] + 2
+
+
+async def test_a_setpoint_behind_late_ones_passes_when_it_is_in_time_itself():
+    async with UdpEndpoint("udpin:127.0.0.1:0", late_after_s=10.0) as endpoint:
+        got = []
+        endpoint.on_frames = got.append
+        with udp_socket(endpoint.local_address) as planner:
+            planner.send(setpoint(1.0))
+            await until(lambda: bool(got))
+    assert [frame.data for frame in got[0]] == [setpoint(1.0)]
+    assert endpoint.counters.late_setpoints == 0
+
+
+async def test_without_a_limit_nothing_is_late():
+    async with UdpEndpoint("udpin:127.0.0.1:0") as endpoint:
+        got = []
+        endpoint.on_frames = got.append
+        with udp_socket(endpoint.local_address) as planner:
+            planner.send(setpoint(1.0))
+            time.sleep(0.3)  # noqa: ASYNC251  the loop is held up: that is the test
+            await until(lambda: bool(got))
+    assert [frame.data for frame in got[0]] == [setpoint(1.0)]

@@ -1,0 +1,43 @@
+"""The kernel's time of arrival of what was read from a UDP socket."""
+
+import socket
+import time
+
+from companion.mavlink.arrival import datagram_wait
+
+
+def test_it_tells_how_long_a_datagram_waited():
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        waited_ns = datagram_wait(receiver)
+        assert waited_ns() == 0
+        while not waited_ns():  # the kernel begins to stamp a moment after it was asked to
+            sender.sendto(b"any", receiver.getsockname())
+            time.sleep(0.02)
+            receiver.recv(100)
+        sender.sendto(b"old", receiver.getsockname())
+        time.sleep(0.2)
+        sender.sendto(b"new", receiver.getsockname())
+        assert receiver.recv(100) == b"old"
+        old_ns = waited_ns()
+        assert receiver.recv(100) == b"new"
+        assert old_ns >= 200_000_000
+        assert waited_ns() < old_ns
+
+
+def test_a_date_set_back_makes_no_negative_wait(monkeypatch):
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        waited_ns = datagram_wait(receiver)
+        sender.sendto(b"any", receiver.getsockname())
+        receiver.recv(100)
+        monkeypatch.setattr(time, "time_ns", lambda: 0)
+        assert waited_ns() == 0

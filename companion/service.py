@@ -71,7 +71,7 @@ _HEALTH_LATE_NS: Final = 1_000_000_000
 """Health that has not run for this long means that this process does not work: no HEARTBEAT then."""
 _RATE_BACK: Final = 1.2
 """A frame rate that fell below the floor counts as back at this multiple of it: one at the floor must not flap."""
-_LATE_SETPOINT_S: Final = 0.25
+_LATE_SETPOINT_S: Final = 0.4
 """Setpoints that waited longer for this process are dropped. Planners send several in that time, and the newest passes."""
 _REOPEN_DELAYS_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 

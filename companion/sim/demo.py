@@ -109,8 +109,8 @@ async def _run(output: Path, console: Console) -> list[Part]:
 def summarise(parts: Sequence[Part]) -> dict[str, Any]:
     """Return the totals over all parts.
 
-    forwarded + substituted + held + turned = setpoints_in. The counts are the service's own; lost, z_changed and
-    altered_other come from comparing the bytes at both ends.
+    forwarded + substituted + held + turned + dropped = setpoints_in. The counts are the service's own; lost, z_changed
+    and altered_other come from comparing the bytes at both ends, and what was dropped on purpose is not lost.
     """
     totals: Counter[str] = Counter()
     detections: Counter[str] = Counter()
@@ -118,9 +118,13 @@ def summarise(parts: Sequence[Part]) -> dict[str, Any]:
         for name in ("frames", "setpoints_in", "forwarded", "substituted", "held", "turned"):
             totals[name] += part.summary.get(name, 0)
         detections.update(part.summary.get("detections", {}))
+        late = part.summary.get("planner_late_setpoints", 0)
+        dropped = sum(part.summary.get("dropped", {}).values())
+        totals["setpoints_in"] += late
+        totals["dropped"] += dropped + late
         if part.traffic is not None:
             totals["z_changed"] += part.traffic.z_changed
-            totals["lost"] += part.traffic.setpoints_lost + part.traffic.other_lost
+            totals["lost"] += part.traffic.setpoints_lost - dropped - late + part.traffic.other_lost
             totals["altered_other"] += part.traffic.other_altered
     names = (
         "setpoints_in",
@@ -128,6 +132,7 @@ def summarise(parts: Sequence[Part]) -> dict[str, Any]:
         "substituted",
         "held",
         "turned",
+        "dropped",
         "z_changed",
         "lost",
         "altered_other",
@@ -184,10 +189,11 @@ async def _footage(output: Path, display: Display) -> Part:
             FakeAutopilot(to_autopilot, replay=poses, keep_frames=True) as autopilot,
             Planner(to_planner, rate_hz=_PLANNER_HZ, keep_frames=True) as planner,
         ):
-            joined = await _start(planner, autopilot, _ahead(poses, 0.0))
-            started_ns = int((await service.wait_for("source_started", _WORKER_START_S))["started_ns"])
+            # Poses begin with the frames, armed or not: begun later they would jump to where the frames are by then.
+            joined, started_ns = await asyncio.gather(
+                _start(planner, autopilot, _ahead(poses, 0.0)), _replay_with_frames(service, autopilot)
+            )
             video.started_ns = started_ns
-            autopilot.start_replay(started_ns)
             elapsed_s = 0.0
             while elapsed_s < poses.duration_s:
                 planner.aim(_ahead(poses, elapsed_s))
@@ -249,6 +255,13 @@ async def _room(output: Path, display: Display) -> Part:
     display.say("writing the annotated video")
     part.video = await asyncio.to_thread(video.write)
     return part
+
+
+async def _replay_with_frames(service: CompanionProcess, autopilot: FakeAutopilot) -> int:
+    """Begin the recorded poses when the source does; return when that was, in monotonic ns."""
+    started_ns = int((await service.wait_for("source_started", _WORKER_START_S))["started_ns"])
+    autopilot.start_replay(started_ns)
+    return started_ns
 
 
 async def _addresses(service: CompanionProcess) -> tuple[Address, Address]:
@@ -427,7 +440,7 @@ def _print_summary(console: Console, parts: Sequence[Part], summary: Mapping[str
     for kind in sorted(summary["detections"]):
         counts = [part.summary.get("detections", {}).get(kind, 0) for part in parts]
         table.add_row(f"answers: {kind}", *map(str, counts), str(summary["detections"][kind]))
-    for name in ("lost", "altered_other", "z_changed"):
+    for name in ("dropped", "lost", "altered_other", "z_changed"):
         table.add_row(name, *([""] * len(parts)), str(summary[name]))
     for name in ("detection_ms", "frame_to_setpoint_ms"):
         cells = [f"{p.summary[name]['p50']} / {p.summary[name]['p95']}" for p in parts]

@@ -23,7 +23,7 @@ def test_the_demo_runs_to_its_end_and_its_figures_add_up(tmp_path: Path):
     assert result.returncode == 0, result.stderr
     assert "Traceback" not in result.stderr
     summary = json.loads(result.stdout)
-    counts = [summary[name] for name in ("forwarded", "substituted", "held", "turned")]
+    counts = [summary[name] for name in ("forwarded", "substituted", "held", "turned", "dropped")]
     assert sum(counts) == summary["setpoints_in"] > 200
     assert summary["substituted"] > 20
     assert summary["turned"] > 0

@@ -206,12 +206,16 @@ async def test_ten_thousand_messages_each_way_while_the_worker_is_killed_ten_tim
                 assert kills == 10
                 assert len(service.of("worker_died")) >= 9
                 assert result.setpoints_sent > 2000
-                assert (result.setpoints_lost, result.z_changed) == (0, 0)
+                assert result.z_changed == 0
                 assert (result.other_lost, result.other_altered) == (0, 0)
                 assert result.other_sent > 15_000
         summary = service.of("summary")[-1]
+        late = summary[
+            "planner_late_setpoints"
+        ]  # where this machine held the service up for long: dropped on purpose
+        assert result.setpoints_lost == late < result.setpoints_sent / 10
         counts = [summary[name] for name in ("forwarded", "substituted", "held", "turned")]
-        assert sum(counts) == summary["setpoints_in"] == result.setpoints_sent
+        assert sum(counts) == summary["setpoints_in"] == result.setpoints_sent - late
         assert summary["held"] > 1000, "no detection: the setpoints are held"
         assert service.returncode == 0
         assert service.other_lines == []

@@ -62,6 +62,9 @@ _NAMES: Final = {
 _ACTIONS: Final = ("substituted", "held", "turned")
 _TELEMETRY: Final = telemetry.MESSAGE_IDS
 _AUTOPILOT_COMPONENT: Final = 1
+_ATTITUDES: Final = frozenset({telemetry.ATTITUDE, telemetry.ATTITUDE_QUATERNION})
+_ATTITUDE_EVERY_NS: Final = 8_000_000
+"""Attitudes that follow each other faster wait for the next one, each with its own time: read together they cost a fifth."""
 _VEHICLE_SILENT_NS: Final = 5_000_000_000
 """After this another autopilot may become the one whose telemetry counts."""
 
@@ -226,6 +229,8 @@ class InlineProxy:
         self._last_failure = ""
         self._sources = SetpointSources()
         self._signatures = signatures
+        self._attitudes: list[tuple[RawFrame, int]] = []
+        self._attitudes_read_ns = -_VEHICLE_SILENT_NS
         self._own = own
         self._own_ids = frozenset() if own is None else own.message_ids
 
@@ -278,6 +283,7 @@ class InlineProxy:
         request = requests.engage_request(frame, self._vehicle)
         if request is None:
             return
+        self._read_attitudes()
         try:
             self._handler.on_engage_request(request, now_ns)
         except Exception as error:  # noqa: BLE001  the request goes on whatever the handler does
@@ -313,6 +319,7 @@ class InlineProxy:
             return self._unprotected(frame, "signed", name)
         if setpoint is None:
             return self._unprotected(frame, name, "not handled")
+        self._read_attitudes()
         try:
             verdict = self._handler.on_setpoint(setpoint, frame.system_id, frame.component_id, now_ns)
             if isinstance(verdict, Unprotected):
@@ -392,8 +399,23 @@ class InlineProxy:
         self.counters.to_planner_frames += self.network.forward(link, passed)
         if reads:  # behind the sending: what the planner waits for does not wait for us
             for frame in passed:
-                if frame[1] in _TELEMETRY and frame[3] == _AUTOPILOT_COMPONENT:
+                if frame[1] not in _TELEMETRY or frame[3] != _AUTOPILOT_COMPONENT:
+                    continue
+                if frame[1] not in _ATTITUDES:
+                    self._read_attitudes()
                     self._telemetry(frame, now_ns)
+                    continue
+                self._attitudes.append((frame, now_ns))
+                if now_ns - self._attitudes_read_ns >= _ATTITUDE_EVERY_NS:
+                    self._attitudes_read_ns = now_ns
+                    self._read_attitudes()
+
+    def _read_attitudes(self) -> None:
+        """Read those that wait; before anything else is read or decided, so that the order of what is known holds."""
+        if self._attitudes:
+            waiting, self._attitudes = self._attitudes, []
+            for frame, arrived_ns in waiting:
+                self._telemetry(frame, arrived_ns)
 
     def _telemetry(self, frame: RawFrame, now_ns: int) -> None:
         message = telemetry.decode(frame)

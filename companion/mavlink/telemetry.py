@@ -14,6 +14,8 @@ from typing import Any, Final, NamedTuple
 
 from companion.mavlink.framing import CURRENT_MODE, HEADER_V1, HEADER_V2, MAGIC_V1, RawFrame
 
+ATTITUDE: Final = 30
+ATTITUDE_QUATERNION: Final = 31
 MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
 MAV_AUTOPILOT_INVALID: Final = 8
 MAV_AUTOPILOT_PX4: Final = 12
@@ -266,8 +268,8 @@ def _finite(values: tuple[float, ...]) -> bool:
 
 _READERS: Final[dict[int, Callable[[RawFrame], Telemetry | Unusable]]] = {
     0: _heartbeat,
-    30: _attitude,
-    31: _attitude_quaternion,
+    ATTITUDE: _attitude,
+    ATTITUDE_QUATERNION: _attitude_quaternion,
     32: _local_position,
     33: _global_position,
     49: _global_origin,

@@ -5,6 +5,7 @@ import math
 import random
 import socket
 import struct
+from functools import partial
 
 import pytest
 from pymavlink.dialects.v20 import common
@@ -79,6 +80,7 @@ class ScriptedHandler:
 
     def __init__(self, verdict=None):
         self.verdict = Forward() if verdict is None else verdict
+        self.telemetry_ns = []
         self.setpoints, self.telemetry, self.unprotected, self.requests, self.rivals, self.refused = (
             [],
             [],
@@ -108,6 +110,7 @@ class ScriptedHandler:
 
     def on_telemetry(self, message, now_ns):
         self.telemetry.append(message)
+        self.telemetry_ns.append(now_ns)
         if isinstance(self.verdict, Exception):
             raise self.verdict
 
@@ -346,6 +349,53 @@ def test_telemetry_of_the_vehicle_is_decoded_after_it_was_forwarded():
     assert unusable == Unusable(30, "not finite")
     assert local == LocalPosition(9, 1, 2, 3, 0, 0, 0)
     assert bench.proxy.vehicle == heartbeat
+
+
+def test_attitudes_that_come_fast_are_read_together_each_with_its_own_time():
+    bench = Bench()
+    bench.autopilot.receive(PX4_HEARTBEAT)
+    begin_ns = bench.now_ns = 1_000_000_000
+    for ms in range(0, 20, 2):
+        bench.now_ns = begin_ns + ms * 1_000_000
+        bench.autopilot.receive(packed(common.MAVLink_attitude_message(ms, 0, 0, 0, 0, 0, 0), VEHICLE))
+        read = [message.time_boot_ms for message in bench.handler.telemetry[1:]]
+        assert read == list(range(0, ms // 8 * 8 + 2, 2)), (
+            "at once when the last was 8 ms ago, else with the next"
+        )
+    assert bench.handler.telemetry_ns[1:] == [begin_ns + ms * 1_000_000 for ms in range(0, 18, 2)]
+    assert len(bench.planner.sent) == 11, "all were sent on when they came"
+
+
+@pytest.mark.parametrize(
+    "then",
+    [
+        lambda bench: bench.autopilot.receive(
+            packed(common.MAVLink_local_position_ned_message(9, 1, 2, 3, 0, 0, 0), VEHICLE)
+        ),
+        lambda bench: bench.planner.receive(packed(setpoint_message())),
+        lambda bench: bench.planner.receive(
+            packed(common.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0))
+        ),
+    ],
+    ids=["a position", "a setpoint", "a request to arm"],
+)
+def test_attitudes_that_wait_are_read_before_anything_else_is_read_or_decided(then):
+    bench = Bench()
+    order = []
+
+    def noted(call, name, *args):
+        order.append(type(args[0]).__name__ if name == "on_telemetry" else name)
+        return call(*args)
+
+    for name in ("on_telemetry", "on_setpoint", "on_engage_request"):
+        setattr(bench.handler, name, partial(noted, getattr(bench.handler, name), name))
+    bench.autopilot.receive(PX4_HEARTBEAT)
+    for ms in (1, 2, 3):
+        bench.autopilot.receive(packed(common.MAVLink_attitude_message(ms, 0, 0, 0, 0, 0, 0), VEHICLE))
+    assert order == ["Heartbeat", "Attitude"]
+    then(bench)
+    assert order[:4] == ["Heartbeat", "Attitude", "Attitude", "Attitude"]
+    assert len(order) == 5
 
 
 def test_another_autopilot_takes_over_only_when_the_first_is_silent():

@@ -19,9 +19,6 @@ from companion.frames.socket import frame_bytes
 
 Address = tuple[str, int]
 
-_SEND_BUFFER_BYTES = 32_768
-"""Small, so that a slow reader's next frame is a new one, not one that has waited in the kernel."""
-
 
 class FrameServer:
     """A TCP server of frames; ``async with`` is its lifetime.
@@ -113,14 +110,19 @@ class FrameServer:
 
     async def _send_frames(self, writer: asyncio.StreamWriter) -> None:
         sock = writer.get_extra_info("socket")
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         writer.transport.set_write_buffer_limits(high=0)
         sent = self.frames_published
+        buffer_bytes = 0
         while True:
             while self.frames_published == sent:
                 await self._published.wait()
             sent = self.frames_published
+            if len(self._newest) > buffer_bytes:
+                # Room for one frame. More, and a slow reader would get what has waited in the kernel; less, and the rest of each
+                # frame would wait for the reader's acknowledgement, which the kernel delays by 40 ms.
+                buffer_bytes = len(self._newest)
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, buffer_bytes)
             writer.write(self._newest)
             await writer.drain()
 

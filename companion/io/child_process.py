@@ -7,7 +7,6 @@ is closed, after its sinks have stopped or a second later, and when its parent d
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
 import importlib
 import json
@@ -21,6 +20,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Final, cast
 
+from companion.children.parent import die_with_parent
 from companion.config import Config
 from companion.errors import ConfigError
 from companion.io.messages import (
@@ -37,7 +37,6 @@ from companion.io.receiver import Receiver
 from companion.io.sink import SinkFactory
 from companion.io.sink_thread import Outbox, SinkThread
 
-_PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 _STOP_S: Final = 1.0
 _LOWER_PRIORITY: Final = 10
 
@@ -49,7 +48,7 @@ def main() -> int:
         # Both come to all processes of a terminal or of a systemd unit; the service then ends this process, files closed.
         signal.signal(number, signal.SIG_IGN)
     faulthandler.enable()
-    _die_with_parent(parent_pid)
+    die_with_parent(parent_pid)
     with contextlib.suppress(OSError):
         os.nice(_LOWER_PRIORITY)  # flying comes first
     with socket.socket(fileno=socket_fd) as connection:
@@ -145,17 +144,6 @@ def load_factory(name: str) -> SinkFactory:
     except ModuleNotFoundError as error:
         raise ConfigError(f"{module_name} needs {error.name}, which is not installed") from error
     return cast("SinkFactory", getattr(module, function_name))
-
-
-def _die_with_parent(parent_pid: int) -> None:
-    """Have the kernel kill this process when the parent dies, even while a sink hangs in C code."""
-    prctl = ctypes.CDLL(None, use_errno=True).prctl
-    # The kernel reads whole registers: a plain int would leave half of each to chance on some machines.
-    prctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_ulong, ctypes.c_ulong, ctypes.c_ulong)
-    if prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
-    if os.getppid() != parent_pid:  # it died before the line above
-        sys.exit(0)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
+from companion.children.output import OutputLines
+from companion.children.process import status_in_words
 from companion.config import Config
 from companion.io.feed import Feed
 from companion.io.messages import (
@@ -30,7 +32,6 @@ from companion.io.messages import (
 from companion.io.process import IoProcess
 from companion.log import Log
 from companion.vision.backoff import RestartBackoff
-from companion.vision.worker_process import status_in_words
 
 RequestHandler = Callable[[Mapping[str, Any]], Awaitable[Answer]]
 """Does what a sink asks for; what it raises is the answer's reason."""
@@ -42,7 +43,6 @@ _STOP_S: Final = 1.5
 """The sinks' time to close what they have open; with the kill after it the service ends within two seconds."""
 _FIRST_DELAY_S: Final = 1.0
 _LONGEST_DELAY_S: Final = 60.0
-_OUTPUT_LINES: Final = 50
 _MOST_REQUESTS: Final = 16
 """Requests that may be worked on at once; more are refused."""
 
@@ -209,9 +209,7 @@ class _Life:
         self._end: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._is_ready = False
         self._took_s = 0.0
-        self._output = bytearray()
-        self._lines: deque[str] = deque(maxlen=10)
-        self._n_lines = 0
+        self._output = OutputLines(lambda line: self._log.warning("io_output", pid=self.pid, line=line))
 
     @property
     def pid(self) -> int | None:
@@ -221,7 +219,7 @@ class _Life:
     @property
     def tail(self) -> str:
         """The last lines of its own output."""
-        return "\n".join(self._lines)
+        return self._output.last_words
 
     async def start(self, starter: ThreadPoolExecutor, config: Config, sinks: Sequence[str]) -> None:
         """Start the process; raises OSError where there is none to be had."""
@@ -270,7 +268,7 @@ class _Life:
         while self._waiting:
             packet, fd = self._waiting[0]
             try:
-                process.send(packet, fd)
+                process.send_packet(packet, fd)
             except (BlockingIOError, InterruptedError):
                 return
             except OSError as error:
@@ -310,20 +308,5 @@ class _Life:
             self._end.set_result(reason)
 
     def _read_output(self) -> None:
-        process = self._process
-        if process is None:
-            return
-        data = b""
-        with contextlib.suppress(BlockingIOError):
-            data = process.read_output()
-            if not data:
-                asyncio.get_running_loop().remove_reader(process.output_fd)
-        self._output += data
-        *lines, rest = bytes(self._output).split(b"\n")
-        self._output = bytearray(rest[-1000:])
-        for line in lines:
-            text = line[:1000].decode("utf-8", "backslashreplace").rstrip()
-            self._lines.append(text)
-            self._n_lines += 1
-            if self._n_lines <= _OUTPUT_LINES:
-                self._log.warning("io_output", pid=process.pid, line=text)
+        if self._process is not None:
+            self._output.read_from(self._process)

@@ -7,14 +7,13 @@ when its socket is closed, when its parent dies in whatever way, and after an ex
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
-import os
 import signal
 import socket
 import sys
 import traceback
 
+from companion.children.parent import die_with_parent
 from companion.errors import ConfigError
 from companion.frames.source import Frame
 from companion.io.messages import pack_arrays
@@ -36,7 +35,6 @@ from companion.vision.messages import (
 )
 from companion.vision.pipeline import Pipeline, WithDetails, WithIdleWork, load_factory
 
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _MAX_TRACEBACK = 20_000
 
 
@@ -45,7 +43,7 @@ def main() -> int:
     parent_pid, socket_fd = (int(argument) for argument in sys.argv[1:3])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the service, which ends this process
     faulthandler.enable()
-    _die_with_parent(parent_pid)
+    die_with_parent(parent_pid)
     with socket.socket(fileno=socket_fd) as connection:
         try:
             return _serve(connection)
@@ -107,17 +105,6 @@ def _send_details(connection: socket.socket, message: Detect, pipeline: WithDeta
 
 def _send(connection: socket.socket, message: FromWorker) -> None:
     connection.send(pack_from_worker(message))
-
-
-def _die_with_parent(parent_pid: int) -> None:
-    """Have the kernel kill this process when the parent dies, even while the pipeline hangs in C code."""
-    prctl = ctypes.CDLL(None, use_errno=True).prctl
-    # The kernel reads whole registers: a plain int would leave half of each to chance on some machines.
-    prctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_ulong, ctypes.c_ulong, ctypes.c_ulong)
-    if prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
-    if os.getppid() != parent_pid:  # it died before the line above
-        sys.exit(0)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,7 @@ nothing it said counts after its death. A late or dead worker means *no report*,
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -17,6 +15,8 @@ from typing import Literal
 
 import numpy as np
 
+from companion.children.output import OutputLines
+from companion.children.process import status_in_words
 from companion.clock import Clock
 from companion.config import CameraConfig, DetectorConfig
 from companion.errors import ConfigError, WorkerError
@@ -38,14 +38,11 @@ from companion.vision.messages import (
     Unusable,
 )
 from companion.vision.pipeline import VOID_PIPELINE
-from companion.vision.worker_process import WorkerProcess, status_in_words
+from companion.vision.worker_process import WorkerProcess
 
 WorkerState = Literal["starting", "ready", "busy", "backoff", "stopped"]
 
 _MAX_FRAME_BYTES = 1 << 26
-_OUTPUT_LINES = 50
-"""Lines of a worker's own output that are logged in its lifetime."""
-_TAIL_LINES = 10
 _GRACE_S = 0.3
 
 
@@ -444,14 +441,12 @@ class _Life:
         self._turn = 0
         self._first_answer_ns: int | None = None
         self._last_answer_ns = 0
-        self._output = bytearray()
-        self._output_lines = 0
-        self._tail: deque[str] = deque(maxlen=_TAIL_LINES)
+        self._output = OutputLines(lambda line: self._log.warning("worker_output", pid=self.pid, line=line))
 
     @property
     def tail(self) -> str:
         """The last lines of its own output."""
-        return "\n".join(self._tail)
+        return self._output.last_words
 
     @property
     def answered_for_s(self) -> float:
@@ -566,20 +561,5 @@ class _Life:
         self.inbox.put_nowait(_Ended(reason))
 
     def _on_output(self) -> None:
-        process = self._process
-        if process is None:
-            return
-        data = b""
-        with contextlib.suppress(BlockingIOError):
-            data = process.read_output()
-            if not data:
-                asyncio.get_running_loop().remove_reader(process.output_fd)
-        self._output += data
-        *lines, rest = bytes(self._output).split(b"\n")
-        self._output = bytearray(rest[-1000:])
-        for line in lines:
-            text = line[:1000].decode("utf-8", "backslashreplace").rstrip()
-            self._tail.append(text)
-            self._output_lines += 1
-            if self._output_lines <= _OUTPUT_LINES:
-                self._log.warning("worker_output", pid=process.pid, line=text)
+        if self._process is not None:
+            self._output.read_from(self._process)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.errors import CompanionError, first_of
+from detector.version import ShowVersion
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,6 +42,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="companion",
         description="Keeps an indoor drone flying toward open space: sits between planner and autopilot on MAVLink.",
     )
+    parser.add_argument("--version", action=ShowVersion)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="run the service until SIGINT or SIGTERM")

@@ -14,6 +14,7 @@ from typing import Final
 
 from detector.commands import bench, detect, evaluate, report, video
 from detector.commands.inputs import InputError
+from detector.version import ShowVersion
 
 EXIT_NO_READER: Final = 1
 """Nobody reads what is printed any more."""
@@ -54,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="detector",
         description="Void detection for indoor drones, from optical flow and vanishing points of one camera.",
     )
+    parser.add_argument("--version", action=ShowVersion)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (detect, evaluate, report, video, bench):
         command.add(commands)

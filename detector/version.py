@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import Any
 
 
@@ -16,5 +17,5 @@ class ShowVersion(argparse.Action):
         """Print it and exit."""
         from importlib.metadata import version
 
-        print(f"{parser.prog} {version('void-companion')}")
+        sys.stdout.write(f"{parser.prog} {version('void-companion')}\n")
         parser.exit()

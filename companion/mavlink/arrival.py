@@ -14,6 +14,9 @@ _SIOCGSTAMPNS: Final = 0x8907
 """Linux: time of arrival of the datagram that was read last, as a timespec in native longs (socket(7))."""
 _TIMESPEC: Final = struct.Struct("@ll")
 
+_MOST_NS: Final = 10_000_000_000
+"""Nothing waits longer: the watchdog has ended a service that was held up for so long. It is the clock that was set."""
+
 DatagramWait = Callable[[], int]
 """Tells how long the datagram that was read last had waited, in ns; 0 where the kernel does not know."""
 
@@ -21,8 +24,8 @@ DatagramWait = Callable[[], int]
 def datagram_wait(of: socket.socket) -> DatagramWait:
     """Return how to ask a datagram socket how long what was just read had waited in it.
 
-    The kernel is asked only then, not with each datagram. It stamps by the clock that shows the date: a
-    clock that is set in between makes one answer wrong, which is 0 at least.
+    The kernel is asked only then, not with each datagram. It stamps by the clock that shows the date, and nothing else here goes
+    by it: a wait that is negative or longer than ten seconds says that this clock was set, and counts as none.
 
     Parameters
     ----------
@@ -44,7 +47,8 @@ def datagram_wait(of: socket.socket) -> DatagramWait:
             return 0
         seconds, nanoseconds = _TIMESPEC.unpack(buffer)
         arrived_ns: int = seconds * 1_000_000_000 + nanoseconds
-        return max(0, time.time_ns() - arrived_ns)
+        waited = time.time_ns() - arrived_ns
+        return waited if 0 <= waited <= _MOST_NS else 0
 
     with suppress(OSError):
         fcntl.ioctl(fd, _SIOCGSTAMPNS, buffer)  # the first question, unanswered, turns stamping on

@@ -16,6 +16,7 @@ WALL_CLOCK = {
     *("date.today", "datetime.date.today"),
 }
 MAY = {
+    "companion/mavlink/arrival.py": "the kernel stamps datagrams by it; what cannot be a wait is not believed",
     "companion/mavlink/signing.py": "MAVLink's signatures carry the time since 2015; ours never go back",
     "companion/recorder/sink.py": "recordings are named and dated by it",
     "companion/recorder/disk.py": "writes such a name",

@@ -3,6 +3,8 @@
 import socket
 import time
 
+import pytest
+
 from companion.mavlink.arrival import datagram_wait
 
 
@@ -29,7 +31,8 @@ def test_it_tells_how_long_a_datagram_waited():
         assert waited_ns() < old_ns
 
 
-def test_a_date_set_back_makes_no_negative_wait(monkeypatch):
+@pytest.mark.parametrize("jump_s", [-3600, 3600, 11])
+def test_a_clock_that_was_set_is_no_wait(monkeypatch, jump_s):
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
@@ -39,5 +42,6 @@ def test_a_date_set_back_makes_no_negative_wait(monkeypatch):
         waited_ns = datagram_wait(receiver)
         sender.sendto(b"any", receiver.getsockname())
         receiver.recv(100)
-        monkeypatch.setattr(time, "time_ns", lambda: 0)
+        set_ns = time.time_ns() + jump_s * 1_000_000_000
+        monkeypatch.setattr(time, "time_ns", lambda: set_ns)
         assert waited_ns() == 0

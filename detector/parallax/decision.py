@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from detector.parallax.params import ParallaxParams
 from detector.parallax.plane import distance_along_axis_m, plane_is_wall
 from detector.parallax.ranges import contact_about
-from detector.parallax.void_map import Gap, VoidMap, VoidMapParams, choose_gap, void_map
+from detector.parallax.void_map import BINS, Gap, VoidMap, VoidMapParams, bin_of, choose_gap, void_map
 from detector.results import (
     Detection,
     Diagnostics,
@@ -124,19 +124,31 @@ def decide_on(
     unit_m
         Metres that its unit stands for.
     """
-    wall = _plane_ahead(geometry, params)
-    gap = choose_gap(found, map_params, wanted_rad=wanted_rad, unit_m=unit_m)
-    if wall is not None and (gap is None or not _is_beyond(geometry, gap)):
-        return Decision(found, SINGLE_PLANE, time_to_contact=wall)
+    gap = choose_gap(_in_picture(geometry, found), map_params, wanted_rad=wanted_rad, unit_m=unit_m)
+    in_metres = found.metric and geometry.is_level
+    if in_metres and gap is not None:
+        # Where the free distances themselves are known they say what a wall is: along a slanted one there may be far to go.
+        if float(found.free_m[found.known].max()) < params.wall_limit_m:
+            return Decision(found, SINGLE_PLANE, time_to_contact=_nearest_contact(geometry))
+    else:
+        wall = _plane_ahead(geometry, params)
+        if wall is not None and (gap is None or not _is_beyond(geometry, gap)):
+            return Decision(found, SINGLE_PLANE, time_to_contact=wall)
     if gap is None:
         return Decision(found, NONE, detail="no direction in view has samples enough")
-    if found.metric and geometry.is_level and float(found.free_m[found.known].max()) < params.wall_limit_m:
-        return Decision(found, SINGLE_PLANE, time_to_contact=_nearest_contact(geometry))
     ray, point_px = _seen_at(geometry, gap.azimuth_rad)
     if point_px is None:
         return Decision(found, NONE, detail="the free direction lies outside the picture")
     contact = contact_about(geometry.depths, geometry.motion, ray, _CONTACT_GATE_RAD)
     return Decision(found, GAP, gap, point_px, contact)
+
+
+def _in_picture(geometry: PairGeometry, found: VoidMap) -> VoidMap:
+    """Return the map of the directions that the picture shows: those beside it are known by what lies next to them, but cannot be pointed at."""
+    rays = geometry.samples.rays_level
+    shown = np.zeros(BINS, np.bool_)
+    shown[bin_of(np.arctan2(rays[:, 1], rays[:, 0]))] = True
+    return found.where(shown)
 
 
 def _plane_ahead(geometry: PairGeometry, params: ParallaxParams) -> TimeToContact | None:

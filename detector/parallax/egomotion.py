@@ -152,6 +152,7 @@ def estimate_egomotion(
     *,
     attitude_given: bool,
     direction_prior: NDArray[np.float64] | None = None,
+    start: Egomotion | None = None,
 ) -> Egomotion | None:
     """Estimate how the camera moved.
 
@@ -165,6 +166,8 @@ def estimate_egomotion(
         Whether that rotation came from an attitude, and so is good to ``attitude_sigma_deg``.
     direction_prior
         (3,) from the earlier to the later position in the later camera's axes, any length; None where nothing is known.
+    start
+        Of the same pair, from a first look at it: where the search begins, and no prior.
 
     Returns
     -------
@@ -178,7 +181,9 @@ def estimate_egomotion(
     if len(used) > params.most_samples:
         used = used.where(np.linspace(0, len(used) - 1, params.most_samples).astype(np.intp))
     problem = _Problem.of(used, params, attitude_given=attitude_given, direction_prior=direction_prior)
-    if direction_prior is not None:
+    if start is not None:
+        state = _minimised(problem, _State(start.correction, start.direction_later), _ROUNDS)
+    elif direction_prior is not None:
         state = _minimised(problem, _State(np.eye(3), _unit(direction_prior)), _ROUNDS)
     else:
         state = _best_of_starts(problem, params)

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from detector.camera_model import CameraModel
 from detector.dense_flow import turned_picture
+from detector.parallax.depth_sweep import SweptDepth
 from detector.parallax.params import ParallaxParams
 from detector.rotation import fit_rotation, rotation_matrix
 
-_LK_WINDOW_PX: Final = 11
+LK_WINDOW_PX: Final = 11
+"""Of the flow's last step, and so of what the picture is asked for."""
 _LK_CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 6, 0.02)
 _LK_MOST_PX: Final = 1.5
 """Lucas-Kanade refines; where it goes farther than this it went astray."""
@@ -55,6 +57,8 @@ class FlowField:
         (N,) textured, seen by both frames, and the way back ends at the start.
     camera
         The model that pixels belong to (full size).
+    swept
+        Depth from a sweep of planes, where there was one.
     """
 
     later_px: NDArray[np.float64]
@@ -64,6 +68,7 @@ class FlowField:
     textured: NDArray[np.bool_]
     believed: NDArray[np.bool_]
     camera: CameraModel
+    swept: SweptDepth | None = None
 
     def __len__(self) -> int:
         return len(self.later_px)
@@ -111,9 +116,9 @@ def measure_flow(
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     back = np.asarray(search.calc(now, turned, None), np.float32)  # type: ignore[call-overload]  # no start is allowed
     forth = np.asarray(search.calc(turned, now, None), np.float32)  # type: ignore[call-overload]
-    at = _grid(size, params.step_px)
+    at = sample_grid(size, params.step_px)
     column, row = at.T.astype(np.intp)
-    information, strongest = _information(now, column, row, grey_noise(now), params)
+    information, strongest = texture(now, column, row, grey_noise(now), params)
     textured = strongest > 1.0 / params.informative_sigma_px**2
     found = (at + back[row, column]).astype(np.float32)
     believed = np.zeros(len(at), np.bool_)
@@ -159,7 +164,7 @@ def coarse_rotation(
     size = (later.shape[1] // reduction, later.shape[0] // reduction)
     small = camera.scaled_to(*size)
     before, now = _reduced(earlier, size), _reduced(later, size)
-    at = _grid(size, _COARSE_STEP_PX)
+    at = sample_grid(size, _COARSE_STEP_PX)
     column, row = at.T.astype(np.intp)
     strength = cv2.cornerMinEigenVal(now, 7, ksize=3)[row, column]
     chosen = strength > np.quantile(strength, 0.4)
@@ -231,7 +236,7 @@ def _refined(
         turned,
         at[:, None],
         found[:, None].copy(),
-        winSize=(_LK_WINDOW_PX, _LK_WINDOW_PX),
+        winSize=(LK_WINDOW_PX, LK_WINDOW_PX),
         maxLevel=0,
         criteria=_LK_CRITERIA,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -241,7 +246,7 @@ def _refined(
     return np.where(kept[:, None], better, found).astype(np.float32)
 
 
-def _information(
+def texture(
     image: NDArray[np.uint8],
     column: NDArray[np.intp],
     row: NDArray[np.intp],
@@ -254,13 +259,13 @@ def _information(
     """
     d_x = cv2.Scharr(image, cv2.CV_32F, 1, 0, scale=1.0 / 32.0)
     d_y = cv2.Scharr(image, cv2.CV_32F, 0, 1, scale=1.0 / 32.0)
-    window = (_LK_WINDOW_PX, _LK_WINDOW_PX)
+    window = (LK_WINDOW_PX, LK_WINDOW_PX)
     xx, xy, yy = (
         np.asarray(cv2.boxFilter(product, cv2.CV_32F, window, normalize=False), np.float64)[row, column]
         for product in (d_x * d_x, d_x * d_y, d_y * d_y)
     )
     # Noise has gradients too, the same in all directions: what is left without them is texture.
-    noise = _LK_WINDOW_PX**2 * _SCHARR_NOISE * noise_grey**2
+    noise = LK_WINDOW_PX**2 * _SCHARR_NOISE * noise_grey**2
     xx, xy, yy = _without(xx, xy, yy, params.noise_factor * noise)
     # Neighbouring pixels are not independent (the lens, the sensor's interpolation): a quarter of them are.
     scale = 0.25 / (2.0 * max(params.grey_sigma, noise_grey) ** 2)
@@ -299,7 +304,8 @@ def grey_noise(image: NDArray[np.uint8]) -> float:
     return float(np.median(np.abs(response))) / (0.6745 * 6.0)
 
 
-def _grid(size: tuple[int, int], step_px: int) -> NDArray[np.float32]:
+def sample_grid(size: tuple[int, int], step_px: int) -> NDArray[np.float32]:
+    """Return the (N, 2) points that the flow is measured at."""
     half = step_px // 2
     columns, rows = np.meshgrid(np.arange(half, size[0], step_px), np.arange(half, size[1], step_px))
     return np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float32)

@@ -80,6 +80,48 @@ class ParallaxParams(BaseModel):
         ),
     ] = 80
 
+    # ------------------------------------------------------------------ first look and sweep of planes
+    coarse_width_px: Annotated[
+        int,
+        Field(
+            ge=80,
+            le=4096,
+            description="Where a pose says which way the camera went, the first look at the motion is taken at about this width. Larger: surer, slower.",
+        ),
+    ] = 320
+    sweep_planes: Annotated[
+        int,
+        Field(
+            ge=2,
+            le=256,
+            description="Planes that are tried, from infinity to the nearest. Larger: finer, slower.",
+        ),
+    ] = 48
+    sweep_nearest: Annotated[
+        float,
+        Field(
+            gt=0,
+            lt=0.95,
+            description="Share of its distance from the focus that a place on the nearest plane moved by; 0.6 is two thirds of a baseline away. Larger: nearer things are found, the planes lie wider apart.",
+        ),
+    ] = 0.6
+    swept_margin: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=10,
+            description="A swept depth counts where its plane fits by this much (of the local contrast) better than others. Larger: fewer, surer.",
+        ),
+    ] = 0.75
+    swept_sigma: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=1,
+            description="Standard deviation of a swept inverse depth, 1/baseline. Larger: it tells less of what is far.",
+        ),
+    ] = 0.01
+
     # ------------------------------------------------------------------ rotation and direction of travel
     attitude_sigma_deg: Annotated[
         float,

@@ -1,6 +1,6 @@
-"""The parallax method for one pair of frames: flow, motion, plane or depth, ranges, and what the void map makes of them.
+"""The parallax method for one pair of frames: a first look, a sweep of planes, flow, motion, plane or depth, ranges, and what the void map makes of them.
 
-    flow_field -> egomotion -> plane, ranges -> void map -> answer
+    flow_field -> egomotion -> depth_sweep -> guided_flow -> egomotion -> plane, ranges -> void map -> answer
 
 What the answer distinguishes: **no motion** (the flow is a rotation's), **too little texture**, **single plane** (a wall: one plane comes nearer, or nothing is
 free beyond the wall limit), **gap** (also when everything is far: then the map is free to its horizon).
@@ -21,6 +21,7 @@ from detector.camera_model import CameraModel
 from detector.flow import Tracks
 from detector.frame import Frame, prepare
 from detector.parallax.decision import Decision, decide
+from detector.parallax.depth_sweep import sweep_depth
 from detector.parallax.egomotion import (
     Egomotion,
     estimate_egomotion,
@@ -29,6 +30,7 @@ from detector.parallax.egomotion import (
     still_limit_rad,
 )
 from detector.parallax.flow_field import FlowField, measure_flow
+from detector.parallax.guided_flow import measure_guided_flow
 from detector.parallax.params import ParallaxParams
 from detector.parallax.plane import PlaneFit, fit_plane
 from detector.parallax.ranges import InverseDepths, flight_frame, inverse_depths, ranged_samples
@@ -134,6 +136,9 @@ class ParallaxDetector:
         self.map_params = map_params or VoidMapParams()
         self._frame_params = frame_params or DetectorParams.preset("default")
         self._timer = timer
+        self._small = self.params.model_copy(
+            update={"width_px": min(self.params.width_px, self.params.coarse_width_px)}
+        )
 
     def prepare(self, image: NDArray[np.uint8]) -> Frame:
         """Return a frame with its quality judged; in a stream, prepare each one once.
@@ -193,15 +198,45 @@ class ParallaxDetector:
             reason, detail = fault
             return _nothing(reason, detail, Diagnostics(seconds=seconds))
         clock.step("frames")
-        field = measure_flow(first.image, second.image, intrinsics.camera, later_from_earlier, self.params)
+        camera = intrinsics.camera
+        direction = None
+        if (
+            translation_earlier_m is not None
+            and later_from_earlier is not None
+            and self._moved(translation_earlier_m)
+        ):
+            direction = later_from_earlier @ translation_earlier_m
+        # Where a pose says which way the camera went, a small picture is enough to make sure of it.
+        look = self.params if direction is None else self._small
+        coarse = measure_flow(first.image, second.image, camera, later_from_earlier, look)
+        clock.step("first_look")
+        glance = estimate_egomotion(
+            coarse,
+            look,
+            attitude_given=later_from_earlier is not None,
+            direction_prior=direction,
+        )
+        clock.step("first_motion")
+        if glance is None:
+            return self._answer(
+                coarse, None, intrinsics, later_from_earlier, translation_earlier_m, level_from_later, clock
+            )
+        swept = sweep_depth(
+            first.image, second.image, camera, glance.later_from_earlier, glance.direction_later, self.params
+        )
+        clock.step("sweep")
+        field = measure_guided_flow(
+            first.image, second.image, camera, coarse.later_from_earlier, glance, swept, self.params
+        )
         clock.step("flow")
         return self._answer(
-            field, intrinsics, later_from_earlier, translation_earlier_m, level_from_later, clock
+            field, glance, intrinsics, later_from_earlier, translation_earlier_m, level_from_later, clock
         )
 
     def _answer(
         self,
         field: FlowField,
+        glance: Egomotion | None,
         intrinsics: Intrinsics,
         later_from_earlier: NDArray[np.float64] | None,
         translation_earlier_m: NDArray[np.float64] | None,
@@ -222,7 +257,7 @@ class ParallaxDetector:
         left_rad = parallax_left_rad(field)
         baseline_m = None if translation_earlier_m is None else float(np.linalg.norm(translation_earlier_m))
         # A camera that is known to have moved and sees no parallax looks at something far away.
-        moved = baseline_m is not None and baseline_m >= params.least_baseline_m
+        moved = translation_earlier_m is not None and self._moved(translation_earlier_m)
         limit_rad = still_limit_rad(camera, params)
         if left_rad < limit_rad and not moved:
             detail = (
@@ -235,7 +270,11 @@ class ParallaxDetector:
             else later_from_earlier @ translation_earlier_m
         )
         motion = estimate_egomotion(
-            field, params, attitude_given=later_from_earlier is not None, direction_prior=direction
+            field,
+            params,
+            attitude_given=later_from_earlier is not None,
+            direction_prior=direction,
+            start=glance,
         )
         clock.step("motion")
         if motion is None:  # believed samples suffice, so only points beyond the lens are left
@@ -261,6 +300,9 @@ class ParallaxDetector:
         return ParallaxResult(
             decision.answer(diagnostics), _tracks(field, motion), estimate.focus_px, geometry, decision, field
         )
+
+    def _moved(self, translation_m: NDArray[np.float64]) -> bool:
+        return float(np.linalg.norm(translation_m)) >= self.params.least_baseline_m
 
     def _frame(self, name: str, image: NDArray[np.uint8] | Frame) -> Frame:
         if isinstance(image, Frame):

@@ -109,8 +109,17 @@ def inverse_depths(field: FlowField, motion: Egomotion, params: ParallaxParams) 
     informative = believed & (variance_px2 < params.informative_sigma_px**2 + params.flow_sigma_px**2)
     backwards = moved_px < -_BACKWARDS_SIGMAS * sigma_px
     kept = ~(informative & (~fits | backwards)) & np.isfinite(inverse)
+    rays = np.column_stack([end, np.ones(len(end))])
+    if field.swept is not None:
+        # What the flow could not tell the planes may: there each place was asked for its whole neighbourhood.
+        depth, margin = field.swept.at(rays)
+        clear = ~informative & np.isfinite(field.later_px).all(axis=1) & (margin >= params.swept_margin)
+        inverse = np.where(clear, depth * depth_to_range, inverse)
+        sigma = np.where(clear, field.swept.sigma * depth_to_range, sigma)
+        informative = informative | clear
+        kept = kept & np.isfinite(inverse)
     informative = informative[kept]
-    rays = np.column_stack([end, np.ones(len(end))])[kept] * depth_to_range[kept, None]
+    rays = rays[kept] * depth_to_range[kept, None]
     return InverseDepths(
         rays,
         np.where(informative, inverse[kept], 0.0),

@@ -43,7 +43,7 @@ def test_every_series_is_measured_on_every_pair_and_thread_setting(figures):
             assert 0.0 < row[f"{name}_s"]["median"] <= row[f"{name}_s"]["p95"]
             assert sum(row["answers"][name].values()) == 4
         assert {"frames", "features", "flow", "clusters", "lines"} <= set(row["steps"]["other"])
-        assert set(row["steps"]["parallax"]) == {"frames", "flow", "motion", "plane", "ranges", "map"}
+        assert {"frames", "first_look", "flow", "motion", "ranges", "map"} <= set(row["steps"]["parallax"])
         assert set(row["steps"]["sfm"]) == {"features", "matching", "essential", "triangulation"}
     assert figures["literal_n_init"] == PARAMS.kmeans_restarts
     counts = [each["n"] for each in figures["points"]]

@@ -49,7 +49,17 @@ def test_figures_and_numbers_of_one_pair(capsys, tmp_path):
     assert report["map"]["unit"] == "baselines"
     assert len(report["map"]["directions"]) == int(found.decision.void_map.known.sum())
     assert report["gap"]["free"] == pytest.approx(found.decision.gap.free_m)
-    assert set(report["seconds"]["steps"]) == {"frames", "flow", "motion", "plane", "ranges", "map"}
+    assert set(report["seconds"]["steps"]) == {
+        "frames",
+        "first_look",
+        "first_motion",
+        "sweep",
+        "flow",
+        "motion",
+        "plane",
+        "ranges",
+        "map",
+    }
 
 
 def test_with_the_motion_it_speaks_of_metres(capsys, tmp_path):

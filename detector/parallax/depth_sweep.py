@@ -11,6 +11,7 @@ What comes out is coarse (a plane is a few percent of the distance from the next
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import cv2
@@ -125,22 +126,20 @@ def sweep_depth(
     closeness = np.linspace(0.0, params.sweep_nearest, params.sweep_planes)
     inverse = closeness / np.maximum(1.0 - closeness, 1e-6)
     inverse = inverse[1.0 + inverse * direction_later[2] > _LEAST_AHEAD]
-    cost = np.stack(
-        [_plane_cost(now, before, reduced, direction_later, float(each)) for each in inverse], axis=-1
-    )
+    cost = np.stack([_plane_cost(now, before, reduced, direction_later, float(each)) for each in inverse])
     unseen = np.isnan(cost)
     cost[unseen] = _UNSEEN_COST
     total = _aggregated(cost)
-    best = np.argmin(total, axis=2)
-    place, count = np.arange(len(inverse)), len(inverse)
-    others = np.where(np.abs(place - best[..., None]) > _NEIGHBOURING, total, np.inf)
-    margin = others.min(axis=2) - total.min(axis=2)
+    best = np.argmin(total, axis=0).astype(np.int16)
+    place, count = np.arange(len(inverse), dtype=np.int16)[:, None, None], len(inverse)
+    others = np.where(np.abs(place - best) > _NEIGHBOURING, total, np.inf)
+    margin = others.min(axis=0) - total.min(axis=0)
     # Where a further plane was not in the earlier picture it may be the true one; and the least cost at the end of the range is no least.
-    further_unseen = (unseen & (place < best[..., None])).any(axis=2)
+    further_unseen = (unseen & (place < best)).any(axis=0)
     clear = np.isfinite(margin) & ~further_unseen & (best < count - 1)
     return SweptDepth(
         reduced,
-        np.interp(_between(total, best), place, inverse).astype(np.float32),
+        np.interp(_between(total, best), np.arange(count), inverse).astype(np.float32),
         np.where(clear, margin / _PATHS, 0.0).astype(np.float32),
         params.swept_sigma if count > 1 else np.inf,
     )
@@ -184,15 +183,26 @@ def _seen_by(
 
 def between_lattice(offset: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float32]:
     """Return the map (H, W, 2) of a picture's pixels to where they are taken from, of which the offsets are known on a lattice from corner to corner."""
-    width, height = size
-    column, row = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    # cv2.resize would take the lattice for the middles of cells.
-    to_x = column * ((offset.shape[1] - 1) / (width - 1))
-    to_y = row * ((offset.shape[0] - 1) / (height - 1))
-    way = np.asarray(cv2.remap(offset.astype(np.float32), to_x, to_y, cv2.INTER_LINEAR), np.float32)
-    way[..., 0] += column
-    way[..., 1] += row
+    pixels, places = _lattice_places(*size, offset.shape[1], offset.shape[0])
+    way = np.asarray(cv2.remap(offset.astype(np.float32), places, None, cv2.INTER_LINEAR), np.float32)  # type: ignore[call-overload]  # one map of both coordinates
+    way += pixels
     return way
+
+
+@lru_cache(maxsize=8)
+def _lattice_places(
+    width: int, height: int, columns: int, rows: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return each pixel (H, W, 2), and where it lies on a lattice from corner to corner."""
+    pixels = np.stack(
+        np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1
+    )
+    # cv2.resize would take the lattice for the middles of cells.
+    scale = np.array([(columns - 1) / (width - 1), (rows - 1) / (height - 1)], np.float32)
+    places = pixels * scale
+    pixels.setflags(write=False)
+    places.setflags(write=False)
+    return pixels, places
 
 
 def _resized(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -241,38 +251,38 @@ def _plane_cost(
 
 
 def _aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the costs (h, w, planes) with those of the cheapest ways to each cell along its row and its column, from both sides."""
-    upright = _along(np.stack([cost, cost[::-1]], axis=1))
-    total = upright[:, 0] + upright[::-1, 1]
-    across = np.ascontiguousarray(cost.transpose(1, 0, 2))
-    level = _along(np.stack([across, across[::-1]], axis=1))
-    return np.asarray(total + (level[:, 0] + level[::-1, 1]).transpose(1, 0, 2), np.float32)
+    """Return the costs (planes, h, w) with those of the cheapest ways to each cell along its row and its column, from both sides."""
+    upright, level = cost.transpose(1, 0, 2), cost.transpose(2, 0, 1)
+    return np.asarray(
+        _both_ways(upright).transpose(1, 0, 2) + _both_ways(level).transpose(1, 2, 0), np.float32
+    )
 
 
-def _along(cost: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return costs (length, ..., planes) with that of the cheapest way from the first index on, in place."""
-    last = cost[0]
-    for index in range(1, len(cost)):
-        least = last.min(axis=-1, keepdims=True)
+def _both_ways(cost: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the costs (length, planes, n) of the cheapest ways along the first axis, forth and back."""
+    side = cost.shape[2]
+    total = np.concatenate([cost, cost[::-1]], axis=2)
+    last = total[0]
+    for index in range(1, len(total)):
+        least = last.min(axis=0)
         way = np.minimum(last, least + _JUMP_COST)
         stepped = last + _STEP_COST
-        np.minimum(way[..., 1:], stepped[..., :-1], out=way[..., 1:])
-        np.minimum(way[..., :-1], stepped[..., 1:], out=way[..., :-1])
+        np.minimum(way[1:], stepped[:-1], out=way[1:])
+        np.minimum(way[:-1], stepped[1:], out=way[:-1])
         way -= least
-        cost[index] += way
-        last = cost[index]
-    return cost
+        last = total[index]
+        last += way
+    return np.asarray(total[:, :, :side] + total[::-1, :, side:], np.float32)
 
 
-def _between(total: NDArray[np.float32], best: NDArray[np.intp]) -> NDArray[np.float64]:
+def _between(total: NDArray[np.float32], best: NDArray[np.int16]) -> NDArray[np.float64]:
     """Return the place of the least cost between the planes, by the parabola through the best one and its neighbours."""
-    count = total.shape[2]
+    count = len(total)
     if count < 3:
         return best.astype(np.float64)
-    middle = np.clip(best, 1, count - 2)
+    middle = np.clip(best, 1, count - 2).astype(np.intp)
     below, at, above = (
-        np.take_along_axis(total, middle[..., None] + step, axis=2)[..., 0].astype(np.float64)
-        for step in (-1, 0, 1)
+        np.take_along_axis(total, middle[None] + step, axis=0)[0].astype(np.float64) for step in (-1, 0, 1)
     )
     bend = np.maximum(below - 2.0 * at + above, 1e-6)
     return np.asarray(middle + np.clip(0.5 * (below - above) / bend, -1.0, 1.0))

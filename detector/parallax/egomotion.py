@@ -462,7 +462,11 @@ def _cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[n
 
 def _tangent(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (3, 2) unit vectors across a unit vector and each other."""
-    least = np.zeros(3)
-    least[int(np.argmin(np.abs(direction)))] = 1.0
-    first = _unit(np.cross(direction, least))
-    return np.column_stack([first, np.cross(direction, first)])
+    x, y, z = (float(value) for value in direction)
+    least = min((abs(x), 0), (abs(y), 1), (abs(z), 2))[1]
+    a, b, c = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[
+        least
+    ]  # direction x the axis that it points least along
+    size = math.sqrt(a * a + b * b + c * c)
+    a, b, c = a / size, b / size, c / size
+    return np.array([[a, y * c - z * b], [b, z * a - x * c], [c, x * b - y * a]])

@@ -261,7 +261,7 @@ def texture(
     d_y = cv2.Scharr(image, cv2.CV_32F, 0, 1, scale=1.0 / 32.0)
     window = (LK_WINDOW_PX, LK_WINDOW_PX)
     xx, xy, yy = (
-        np.asarray(cv2.boxFilter(product, cv2.CV_32F, window, normalize=False), np.float64)[row, column]
+        cv2.boxFilter(product, cv2.CV_32F, window, normalize=False)[row, column].astype(np.float64)
         for product in (d_x * d_x, d_x * d_y, d_y * d_y)
     )
     # Noise has gradients too, the same in all directions: what is left without them is texture.

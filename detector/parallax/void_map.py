@@ -426,8 +426,9 @@ def _first_hits(
     beside = away[member] * np.sin(off)
     distance = away[member] * np.cos(off) - np.sqrt(np.maximum(radius**2 - beside**2, 0.0))
     bin_number %= BINS
-    order = np.lexsort((distance, bin_number))
-    bin_number, distance, member = bin_number[order], np.maximum(distance[order], 0.0), member[order]
+    distance = np.maximum(distance, 0.0)
+    order = np.argsort(bin_number * (2.0 * (limit + radius)) + distance)  # by bin, then by distance
+    bin_number, distance, member = bin_number[order], distance[order], member[order]
     # Agreement is judged by where the surface is, not by what is left to the hull, which may be nothing.
     centre = distance + radius
     last = _HIT_SAMPLES - 1

@@ -21,7 +21,7 @@ from detector.parallax.depth_sweep import SweptDepth
 from detector.parallax.params import ParallaxParams
 from detector.rotation import fit_rotation, rotation_matrix
 
-LK_WINDOW_PX: Final = 11
+LK_WINDOW_PX: Final = 9
 """Of the flow's last step, and so of what the picture is asked for."""
 _LK_CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 6, 0.02)
 _LK_MOST_PX: Final = 1.5

@@ -20,7 +20,7 @@ from detector.parallax.params import ParallaxParams
 _LATTICE_PX: Final = 8
 _LEVELS: Final = 1
 _BRIGHTNESS_PX: Final = 41
-_CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 8, 0.02)
+_CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 5, 0.03)
 _LEAST_AHEAD: Final = 0.1
 
 

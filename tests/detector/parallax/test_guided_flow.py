@@ -1,0 +1,79 @@
+"""Flow that starts from a swept depth, against known motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from detector.parallax.depth_sweep import sweep_depth
+from detector.parallax.egomotion import Egomotion, estimate_egomotion
+from detector.parallax.flow_field import FlowField, measure_flow
+from detector.parallax.guided_flow import measure_guided_flow
+from detector.parallax.params import ParallaxParams
+from tests.detector.parallax.test_flow_field import true_earlier_px
+from tests.fakes.pair_views import View, corridor_view, rotation_deg, wall_view
+
+PARAMS = ParallaxParams()
+
+
+def first_look(seen: View) -> Egomotion:
+    coarse = measure_flow(seen.earlier, seen.later, seen.camera, seen.later_from_earlier, PARAMS)
+    found = estimate_egomotion(coarse, PARAMS, attitude_given=True, direction_prior=seen.translation_later_m)
+    assert found is not None
+    return found
+
+
+def guided(seen: View, *, turn: np.ndarray | None = None) -> FlowField:
+    motion = first_look(seen)
+    swept = sweep_depth(
+        seen.earlier, seen.later, seen.camera, motion.later_from_earlier, motion.direction_later, PARAMS
+    )
+    given = seen.later_from_earlier if turn is None else turn
+    return measure_guided_flow(seen.earlier, seen.later, seen.camera, given, motion, swept, PARAMS)
+
+
+def whitened_error(seen: View, field: FlowField) -> np.ndarray:
+    used = field.where(field.believed)
+    missed = used.earlier_px - true_earlier_px(seen, used)
+    return np.sqrt(np.einsum("ni,nij,nj->n", missed, used.information, missed))
+
+
+def test_flow_is_right_to_the_noise_that_it_claims() -> None:
+    seen = corridor_view()
+    error = whitened_error(seen, guided(seen))
+    assert len(error) > 400
+    assert 0.2 < np.median(error) < 1.6
+    assert np.mean(error > 6.0) < 0.1
+
+
+def test_a_wall_at_two_baselines_is_followed_which_plain_flow_is_not() -> None:
+    seen = wall_view(0.5)
+    plain = measure_flow(seen.earlier, seen.later, seen.camera, seen.later_from_earlier, PARAMS)
+    found = guided(seen)
+    assert found.believed.sum() > 1.5 * plain.believed.sum()
+    assert np.median(whitened_error(seen, found)) < 1.6
+
+
+def test_the_turn_that_is_taken_out_is_the_one_given_not_the_one_found() -> None:
+    seen = corridor_view()
+    off = rotation_deg(0.3, 0.0, -0.2) @ seen.later_from_earlier
+    field = guided(replace(seen, later_from_earlier=off), turn=off)
+    assert np.array_equal(field.later_from_earlier, off)
+    used = field.where(field.believed)
+    # The same points, seen from the earlier camera turned by what was given.
+    rays = seen.camera.pixel_to_ray(used.earlier_px) @ (seen.later_from_earlier @ off.T).T
+    back = replace(used, earlier_px=seen.camera.ray_to_pixel(rays))
+    missed = back.earlier_px - true_earlier_px(seen, used)
+    assert np.median(np.linalg.norm(missed, axis=1)) < 0.7
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.8, 0.0), (1.0, 30.0)])
+def test_exposure_that_changes_is_no_motion(gain: float, offset: float) -> None:
+    seen = corridor_view()
+    earlier = np.clip(gain * seen.earlier.astype(np.float32) + offset, 0, 255).astype(np.uint8)
+    changed = replace(seen, earlier=earlier)
+    field = guided(changed)
+    assert field.believed.sum() > 0.75 * guided(seen).believed.sum()
+    assert np.median(whitened_error(changed, field)) < 1.8

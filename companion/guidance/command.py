@@ -117,11 +117,13 @@ class Command:
         if state is State.FOLLOW:
             return self._follow(s)
         if state is State.STEER and s.gap is not None:
-            psi, room_m = self._evidence.seen.clearer(s.gap.azimuth_rad(s.pose), s.pose, s.now_ns)
+            psi = self._evidence.steered_rad(s)
+            _, room_m = self._evidence.seen.clearer(s.gap.azimuth_rad(s.pose), s.pose, s.now_ns)
             longest_m = min(s.gap.left_m(s.pose), _longest_beside(room_m))
             return self._steer(s, psi, self._evidence.free_m(psi, s.pose, s.now_ns), longest_m)
         if state is State.STEER and s.answer is not None:
-            return self._steer(s, s.answer.azimuth_rad, self._evidence.void_free_m(s.answer, s))
+            psi = self._evidence.steered_rad(s)
+            return self._steer(s, psi, self._evidence.void_free_m(s.answer, s))
         if state is State.PROBE:
             here_m = plan.probe_down_m
             return self._rewrite(*plan.probe_target, plan.probe_yaw_rad, "substituted", s, down_m=here_m)
@@ -144,7 +146,7 @@ class Command:
         return Rewrite(*self._plan.anchor, self._plan.anchor_yaw_rad, "held", self._plan.anchor_down_m)
 
     def _steer(self, s: Situation, psi: float, free_m: float | None, longest_m: float = math.inf) -> Decision:
-        step_m = min(self._step_m(s.goal_m, free_m), longest_m)
+        step_m = min(self._step_m(s.goal_m, free_m), longest_m, self._evidence.ways.reach_m(psi, s.pose))
         out_of_sight = abs(wrap_rad(psi - s.look_rad)) > math.radians(self._config.align_deg)
         if out_of_sight or self._table.choose(s)[1] == LOOK_AGAIN:
             # The camera must look where it flies, and no way is open before it is seen again.
@@ -160,7 +162,11 @@ class Command:
             step_m, wanted_yaw = min(s.goal_m, self._config.max_step_m), wish.yaw_rad
         else:
             _, room_m = self._evidence.seen.clearer(s.bearing_rad, s.pose, s.now_ns)
-            step_m = min(self._step_m(s.goal_m, self._free_to_goal_m(s)), _longest_beside(room_m))
+            step_m = min(
+                self._step_m(s.goal_m, self._free_to_goal_m(s)),
+                _longest_beside(room_m),
+                self._evidence.ways.reach_m(s.bearing_rad, s.pose),
+            )
             if self._table.choose(s)[1] == LOOK_AGAIN:
                 step_m = 0.0
             wanted_yaw = s.bearing_rad - self._camera_yaw_rad

@@ -86,6 +86,9 @@ class DetectionReport:
         Places at the vehicle's height where something was surely seen nearby: north and east in local NED, m.
     earlier_frame_ns
         When the first frame of the pair was exposed, where there was one and it is known.
+    swept_m
+        How far the vehicle's whole width can be moved from the frame's pose through what was looked through (method ``parallax``), along azimuths evenly spaced from north
+        clockwise, m; no more than some 2 m, which stands for "at least so far". Empty: the method does not say.
     detector_s
         Seconds that the detector took.
     """
@@ -110,4 +113,5 @@ class DetectionReport:
     confidence: float | None = None
     obstacles: tuple[tuple[float, float], ...] = ()
     earlier_frame_ns: int | None = None
+    swept_m: tuple[float, ...] = ()
     detector_s: float = 0.0

@@ -140,6 +140,7 @@ class Plan:
             return north_m + step_m * math.cos(azimuth_rad), east_m + step_m * math.sin(azimuth_rad)
 
         free = evidence.seen.free_azimuths(step_m + config.step_margin_m, pose, evidence.speed_m_s, now_ns)
+        free = [way for way in free if evidence.ways.reach_m(way[0], pose) >= step_m]
         if free:
             azimuth, _ = min(free, key=lambda item: abs(wrap_rad(item[0] - look_rad)))
             return "seen free", along(azimuth)
@@ -147,7 +148,9 @@ class Plan:
         if back is not None:
             azimuth = math.atan2(back[1] - east_m, back[0] - north_m)
             return "flown track", along(azimuth)
-        blocked = evidence.free_m(look_rad, pose, now_ns) is not None
+        known_m = evidence.free_m(look_rad, pose, now_ns)
+        # What is measured free for the step and its margin, and was not looked through at its sides, is no worse than what nobody has measured.
+        blocked = known_m is not None and known_m < step_m + config.step_margin_m
         half_step = math.radians(config.turn_step_deg) / 2
         used = self.episode is not None and self.episode.was_bootstrapped(look_rad, half_step)
         if config.bootstrap_probe and not blocked and not used:

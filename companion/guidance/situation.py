@@ -17,6 +17,7 @@ from companion.guidance.gaps import Gap, Gaps
 from companion.guidance.goal import Goal
 from companion.guidance.memory import SeenBearings, Track
 from companion.guidance.observation import DetectionReport, Pose
+from companion.guidance.swept import SeenWays
 from companion.guidance.wish import Wish
 
 _NO_PARALLAX = ("no_motion", "no_earlier_frame")
@@ -132,6 +133,7 @@ class Evidence:
         self.newest_frame_ns = -(1 << 62)
         self.votes: deque[DetectionReport | None] = deque(maxlen=config.wall_n)
         self.seen = SeenBearings(config, vehicle_width_m)
+        self.ways = SeenWays()
         self.track = Track()
         self.gaps = Gaps(margin_m=config.step_margin_m, least_m=_MIN_GAP_M)
         self.blocked: tuple[float, ...] = ()
@@ -169,6 +171,7 @@ class Evidence:
         report = _believed(report, self._config.min_confidence)
         self.last_report_ns = now_ns
         self.last_report = report
+        self.ways.add(report)
         is_of_this_frame = (
             _pair_began_ns(report) >= self._pairs_after_ns
         )  # else the way flown in it is not known
@@ -232,6 +235,7 @@ class Evidence:
         self.drop_measurements(now_ns)
         self._pairs_after_ns = now_ns
         self.seen.clear()
+        self.ways.clear()
         self.track.clear()
         self._arrived = False
 
@@ -240,6 +244,7 @@ class Evidence:
         self.answer = None
         self.votes.clear()
         self.seen.clear()
+        self.ways.clear()
         self.gaps.forget()
         self.track.clear()
         self.goal.forget()
@@ -316,6 +321,15 @@ class Evidence:
     def free_m(self, azimuth_rad: float, pose: Pose, now_ns: int) -> float | None:
         """Return the free distance known along an azimuth, or None."""
         return self.seen.free_m(azimuth_rad, pose, self.speed_m_s, now_ns)
+
+    def steered_rad(self, s: Situation) -> float:
+        """Return the azimuth that STEER flies along: the gap's, with room beside it, or the void's; as far as it was looked through."""
+        wanted = s.bearing_rad
+        if s.gap is not None:
+            wanted, _ = self.seen.clearer(s.gap.azimuth_rad(s.pose), s.pose, s.now_ns)
+        elif s.answer is not None:
+            wanted = s.answer.azimuth_rad
+        return self.ways.further(wanted, s.pose)
 
     def void_free_m(self, answer: Answer, s: Situation) -> float | None:
         """Return what is known of the free distance along the answer's direction."""

@@ -35,6 +35,8 @@ from companion.guidance.situation import Answer, Evidence, Situation
 
 LOOK_AGAIN = "way blocked, looking again"
 """One answer says that no way is open: no step is made, and the vote of the next answers decides."""
+NOT_LOOKED_THROUGH = "way not looked through"
+"""At rest, the camera towards the way: something could stand beside it that was never in view. A step back shows it."""
 GAP_SEEN = "gap seen"
 NO_WAY_OUT = "no way out"
 TURNS_ALONG = "the goal turns with the vehicle"
@@ -128,6 +130,23 @@ class Table:
 
     def choose(self, s: Situation) -> Change:
         """Return the state that the situation asks for, whatever the present one."""
+        state, reason = self._wanted(s)
+        if s.reached or s.speed_m_s > self._config.moving_m_s or not self._waits_to_look(state, s):
+            return state, reason
+        return State.HOLD, NOT_LOOKED_THROUGH
+
+    def _waits_to_look(self, state: State, s: Situation) -> bool:
+        """Whether the way of a state is in sight and was not looked through for a step."""
+        if state is State.FOLLOW:
+            azimuth = s.bearing_rad
+        elif state is State.STEER and (s.gap is not None or s.answer is not None):
+            azimuth = self._evidence.steered_rad(s)
+        else:
+            return False
+        in_sight = abs(wrap_rad(azimuth - s.look_rad)) <= math.radians(0.5 * self._config.align_deg)
+        return in_sight and self._evidence.ways.reach_m(azimuth, s.pose) <= 0.0
+
+    def _wanted(self, s: Situation) -> Change:
         if s.reached:
             return State.FOLLOW, "at the goal"
         in_view = s.off_axis_rad <= math.radians(self._config.view_deg)

@@ -95,6 +95,8 @@ class ParallaxPipeline(VoidPipeline):
         began_s: float,
     ) -> DetectionReport:
         report = super()._report(frame, pose, observation, model, r_ned_from_camera, began_s)
+        if isinstance(observation, ParallaxObservation) and observation.swept_m is not None:
+            report = replace(report, swept_m=tuple(round(float(m), 3) for m in observation.swept_m))
         reading = reading_of(observation)
         if reading is None or pose is None:
             return report

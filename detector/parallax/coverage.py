@@ -26,6 +26,10 @@ _EDGE_SHARE: Final = 0.5
 """At the picture's edge a thing is seen in part only: what is hidden there counts from this share of its width on."""
 _GRAZE_SHARE: Final = 0.2
 """Of the hidden width: what may reach in by no more is the blur of flow at the edge of a thing."""
+_BAND_RAD: Final = math.radians(4.0)
+"""Half the least height of a third, as seen: two rows of samples or more."""
+_STANDING_M: Final = 0.8
+"""How far below the camera a line of sight may pass a place and still tell of what stands there: lower, and it may pass under a table's or a bush's top."""
 _FINE_RAD: Final = math.radians(0.5)
 _SURELY: Final = 2.0
 """Standard deviations."""
@@ -89,6 +93,70 @@ def uncovered_from_m(
         hidden |= outside_rad * distance_m > hidden_width_m
         found[hidden] = distance_m
     return found
+
+
+def looked_past(
+    samples: RangedSamples, distances_m: NDArray[np.float64], hidden_width_m: float, half_height_m: float
+) -> NDArray[np.bool_]:
+    """Return which places were surely looked past, at all of the vehicle's height, by distance and azimuth.
+
+    Parameters
+    ----------
+    samples
+        In metres, in the level frame.
+    distances_m
+        (D,) horizontal.
+    hidden_width_m
+        What is at least so wide must show.
+    half_height_m
+        Of the vehicle. Each third of its height is asked by itself: a low bush, or a tree's lower branches, stand beside samples at flight height that look past them. A plain wall
+        shows nothing at flight height, but the floor in front of it may: a line of sight to the floor beyond a place, which passes it below the vehicle's middle, tells as much.
+
+    Returns
+    -------
+    (D, 720), azimuths half a degree apart from the level frame's x axis: whether it lies, in each third of the height at this distance or below, between two samples that look past
+    this distance and are too near to each other for anything ``hidden_width_m`` wide.
+    """
+    bins = round(math.tau / _FINE_RAD)
+    told = samples.where(samples.informative)
+    past = np.zeros((len(distances_m), bins), np.bool_)
+    if len(told) == 0:
+        return past
+    rays = told.rays_level
+    middle_rad = math.atan2(float(rays[:, 1].sum()), float(rays[:, 0].sum()))
+    place = _wrapped(np.arctan2(rays[:, 1], rays[:, 0]) - middle_rad)
+    order = np.argsort(place)
+    place, nearest = place[order], _nearest(told)[order]
+    elevation = np.arcsin(np.clip(rays[order, 2], -1.0, 1.0))
+    azimuth = _wrapped(np.asarray(np.arange(bins) * _FINE_RAD - middle_rad, np.float64))
+    third_m = 2.0 * half_height_m / 3.0
+    for row, distance_m in enumerate(distances_m):
+        beyond = nearest * distance_m < 1.0
+        drop_m = distance_m * np.tan(elevation)
+        half_m = max(0.5 * third_m, distance_m * math.tan(_BAND_RAD))
+        most_rad = hidden_width_m / distance_m
+        # What stands on the floor hides the floor behind it.
+        past[row] = _between(
+            place[beyond & (drop_m > 0.5 * third_m) & (drop_m <= _STANDING_M)], azimuth, most_rad
+        )
+        thirds = [
+            _between(place[beyond & (np.abs(drop_m - middle_m) <= half_m)], azimuth, most_rad)
+            for middle_m in (0.0, -third_m, third_m)
+        ]
+        past[row] |= np.logical_and.reduce(thirds)
+    return past
+
+
+def _between(
+    seen_rad: NDArray[np.float64], azimuths_rad: NDArray[np.float64], most_rad: float
+) -> NDArray[np.bool_]:
+    """Return which azimuths lie between two of those seen (in order) that are no further apart than ``most_rad``."""
+    if seen_rad.size < 2:
+        return np.zeros(azimuths_rad.shape, np.bool_)
+    right = np.searchsorted(seen_rad, azimuths_rad)
+    inside = (right > 0) & (right < seen_rad.size)
+    gap_rad = seen_rad[np.minimum(right, seen_rad.size - 1)] - seen_rad[np.maximum(right - 1, 0)]
+    return np.asarray(inside & (gap_rad <= most_rad))
 
 
 def reach_in_rad(

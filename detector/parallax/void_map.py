@@ -112,9 +112,9 @@ class VoidMapParams(BaseModel):
         Field(
             ge=0,
             le=1,
-            description="Where less than this share of the directions in the picture is known, no way is flown further than it was looked through. Larger: more careful where there is little texture; 0: never.",
+            description="Where less than this share of the directions in the picture is known, no way is told further than the last pair looked through. Larger: more careful where there is little texture; 0: never (what several pairs looked through limits each step anyway).",
         ),
-    ] = 0.6
+    ] = 0.0
     plateau: Annotated[
         float,
         Field(

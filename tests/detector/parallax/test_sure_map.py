@@ -59,7 +59,7 @@ def plain_room() -> RangedSamples:
 
 def test_in_a_plain_scene_a_way_ends_where_something_could_stand_in_it() -> None:
     samples = plain_room()
-    whole, surely = Flight().take(samples)
+    whole, surely = Flight(VoidMapParams(plain_share=0.6)).take(samples)
     looked_m, ahead = looked_through_m(samples, PARAMS), whole.at(math.radians(8.0))
     assert whole.free_m[ahead] > 3.0, "bridged"
     assert looked_m[ahead] < 1.5

@@ -2,8 +2,8 @@
 
 The furthest direction is chosen on the whole map: ways with a gap between their samples are mostly free. But something near could stand in such a gap
 (a smooth pillar, the plain end of a wall), and what was seen there before is no longer measured when it comes near the edge of the picture. So near things are remembered
-until a pair looks through the place where they stood. And where most of the picture is plain, no direction is flown further than it was looked through: there, what stands in a gap
-shows nowhere else either.
+until a pair looks through the place where they stood. And where most of the picture is plain (``plain_share``, off by default), no direction is told further than the last pair looked
+through: there, what stands in a gap shows nowhere else either. What several pairs looked through, and limits each step, is in :mod:`detector.parallax.seen_space`.
 """
 
 from __future__ import annotations

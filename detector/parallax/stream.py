@@ -238,8 +238,12 @@ class _Pairs:
         if self._frames is None or self.result is None or self.result.field is None:
             return samples
         earlier, later = self._frames
-        same = alike(earlier.image, later.image, self.result.field, samples.pixels_px) >= _ALIKE
-        return replace(samples, informative=samples.informative & same)
+        informative = samples.informative.copy()
+        correlation = alike(
+            earlier.image, later.image, self.result.field, samples.pixels_px[samples.informative]
+        )
+        informative[samples.informative] = correlation >= _ALIKE
+        return replace(samples, informative=informative)
 
     def next(self, pose: CameraPose | None) -> None:
         """Take the pose of the frame that comes next."""

@@ -18,6 +18,7 @@ from detector.parallax.egomotion import Egomotion, plane_points
 from detector.parallax.flow_field import FlowField
 from detector.parallax.params import ParallaxParams
 from detector.parallax.samples import RangedSamples
+from detector.parallax.speckles import lonely
 from detector.results import TimeToContact
 from detector.rotation import rotation_matrix
 
@@ -118,6 +119,7 @@ def inverse_depths(field: FlowField, motion: Egomotion, params: ParallaxParams) 
         sigma = np.where(clear, field.swept.sigma * depth_to_range, sigma)
         informative = informative | clear
         kept = kept & np.isfinite(inverse)
+    kept &= ~lonely(field.later_px, np.nan_to_num(inverse), informative & kept, focal_px)
     informative = informative[kept]
     rays = rays[kept] * depth_to_range[kept, None]
     return InverseDepths(

@@ -23,11 +23,11 @@ _ENOUGH_PROFILES: Final = 4.0
 _AROUND: Final = 3
 _WIDE_RAD: Final = math.radians(6.0)
 CALIBRATION: Final = (
-    (0.198, 0.341),
-    (0.328, 0.439),
-    (0.483, 0.707),
-    (0.662, 0.756),
-    (0.87, 0.852),
+    (0.3, 0.559),
+    (0.494, 0.768),
+    (0.669, 0.818),
+    (0.779, 0.879),
+    (0.92, 0.909),
 )
 """Score, and the share of answers that were right there."""
 

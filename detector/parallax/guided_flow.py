@@ -70,12 +70,16 @@ def measure_guided_flow(
     found, believed = at.astype(np.float64), np.zeros(len(at), np.bool_)
     if textured.any():
         seeds = at[textured]
-        ends, followed = _followed(now, drawn, seeds)
-        home, returned = _followed(drawn, now, ends)
+        ends, followed, unlike_grey = _followed(now, drawn, seeds)
+        home, returned, _ = _followed(drawn, now, ends)
+        alike = unlike_grey <= params.unlike_share * (_contrast(now)[row[textured], column[textured]] + 1.0)
         missed = (home - seeds).astype(np.float64)
         limit = (params.round_trip_px / params.flow_sigma_px) ** 2
         good = (
-            followed & returned & (np.einsum("ni,nij,nj->n", missed, information[textured], missed) < limit)
+            followed
+            & returned
+            & alike
+            & (np.einsum("ni,nij,nj->n", missed, information[textured], missed) < limit)
         )
         source = cv2.remap(
             way, ends[:, None, 0], ends[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -125,9 +129,9 @@ def _brightened(drawn: cv2.typing.MatLike, now: NDArray[np.uint8]) -> NDArray[np
 
 def _followed(
     start: NDArray[np.uint8], end: NDArray[np.uint8], at: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return where points of one picture are in one nearly like it, and whether they could be followed."""
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """Return where points of one picture are in one nearly like it, whether they could be followed, and by how many grey values the two places differ."""
+    found, status, unlike = cv2.calcOpticalFlowPyrLK(
         start,
         end,
         at[:, None],
@@ -137,4 +141,16 @@ def _followed(
         criteria=_CRITERIA,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
-    return np.asarray(found, np.float32).reshape(-1, 2), np.asarray(status.reshape(-1) > 0)
+    return (
+        np.asarray(found, np.float32).reshape(-1, 2),
+        np.asarray(status.reshape(-1) > 0),
+        np.asarray(unlike, np.float32).reshape(-1),
+    )
+
+
+def _contrast(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the standard deviation of the grey values about each pixel."""
+    window = (LK_WINDOW_PX, LK_WINDOW_PX)
+    grey = image.astype(np.float32)
+    mean = cv2.blur(grey, window)
+    return np.asarray(np.sqrt(np.maximum(cv2.blur(grey * grey, window) - mean * mean, 0.0)), np.float32)

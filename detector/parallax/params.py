@@ -35,6 +35,14 @@ class ParallaxParams(BaseModel):
             description="There and back must end within this, where the picture fixes the flow. Larger: laxer.",
         ),
     ] = 0.7
+    unlike_share: Annotated[
+        float,
+        Field(
+            gt=0,
+            le=10,
+            description="The two ends of a flow vector may differ by this share of the picture's contrast there. Larger: more wrong matches on even texture pass. At 0.6 a third of the wrong ones do not, and one in thirty of the right ones.",
+        ),
+    ] = 0.6
     flow_sigma_px: Annotated[
         float,
         Field(gt=0, le=5, description="Noise of the flow of a well textured sample, one axis."),

@@ -20,7 +20,6 @@ from detector.frame import Frame
 from detector.observer import CameraPose, Observation, ObserverParams, VoidObserver
 from detector.parallax.confidence import confidence
 from detector.parallax.decision import GAP, decide_on
-from detector.parallax.likeness import alike
 from detector.parallax.map_memory import MapMemory, MapMemoryParams, RememberedMap
 from detector.parallax.params import ParallaxParams
 from detector.parallax.pipeline import Intrinsics, PairGeometry, ParallaxDetector, ParallaxResult
@@ -29,15 +28,13 @@ from detector.parallax.samples import RangedSamples
 from detector.parallax.seen_space import SeenSpace
 from detector.parallax.sure_map import SureMap
 from detector.parallax.uncalibrated import UncalibratedCamera
-from detector.parallax.void_map import Gap, VoidMap, VoidMapParams, choose_gap, void_map
+from detector.parallax.void_map import Gap, VoidMap, VoidMapParams, choose_gap
 from detector.params import DetectorParams
 from detector.pipeline import PairResult
 from detector.results import Detection, Direction, DirectionKind, NoDetection, NoDetectionReason
 
 _NO_TRACKS: Final = Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
 _CONTACT_GATE_RAD: Final = math.radians(5.0)
-_ALIKE: Final = 0.6
-"""Correlation of the two ends of a sample that counts for what was looked through: of wrong matches on even texture next to none has it, of right ones nine of ten."""
 _SAYS_NOTHING: Final = (NoDetectionReason.NO_MOTION, NoDetectionReason.NO_EARLIER_FRAME)
 """Without parallax there is nothing to see; what was seen before stays so."""
 _ELEVATIONS_RAD: Final = np.radians(sorted(range(-45, 46), key=abs))
@@ -190,10 +187,7 @@ class ParallaxObserver:
         if geometry is None or decision is None or not (geometry.samples.metric and geometry.is_level):
             return result.detection, None
         position_m = (float(pose.position_m[0]), float(pose.position_m[1]))
-        # A direction is as free as what looks alike in both frames says; the pair's own answer is made anew from that.
-        samples = self._pairs.alike(geometry.samples)
-        geometry = replace(geometry, samples=samples)
-        measured, memory = void_map(samples, self._map_params), self._memory
+        measured, memory = decision.void_map, self._memory
         memory.add(measured, position_m, time_ns / 1e9)
         remembered = memory.remembered(position_m, time_ns / 1e9)
         surely = self._sure_map.add(measured, geometry.samples, remembered.found, position_m, time_ns / 1e9)
@@ -231,23 +225,10 @@ class _Pairs:
         self._uncalibrated = uncalibrated
         self._pose: CameraPose | None = None
         self.result: ParallaxResult | None = None
-        self._frames: tuple[Frame, Frame] | None = None
-
-    def alike(self, samples: RangedSamples) -> RangedSamples:
-        """Return the last pair's samples; those whose two ends do not look alike tell nothing."""
-        if self._frames is None or self.result is None or self.result.field is None:
-            return samples
-        earlier, later = self._frames
-        informative = samples.informative.copy()
-        correlation = alike(
-            earlier.image, later.image, self.result.field, samples.pixels_px[samples.informative]
-        )
-        informative[samples.informative] = correlation >= _ALIKE
-        return replace(samples, informative=informative)
 
     def next(self, pose: CameraPose | None) -> None:
         """Take the pose of the frame that comes next."""
-        self._pose, self.result, self._frames = pose, None, None
+        self._pose, self.result = pose, None
 
     def reset(self) -> None:
         """Nothing is kept from pair to pair."""
@@ -264,7 +245,6 @@ class _Pairs:
     ) -> PairResult:
         """Return the answer to one pair."""
         height_px, width_px = later.image.shape
-        self._frames = (earlier, later)
         intrinsics = (
             self._uncalibrated.intrinsics(width_px, height_px)
             if camera is None

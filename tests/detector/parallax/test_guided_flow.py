@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from detector.parallax.flow_field import FlowField, measure_flow
 from detector.parallax.guided_flow import measure_guided_flow
 from detector.parallax.params import ParallaxParams
 from tests.detector.parallax.test_flow_field import true_earlier_px
-from tests.fakes.pair_views import View, corridor_view, rotation_deg, wall_view
+from tests.fakes.pair_views import CAMERA, View, corridor_view, rotation_deg, wall_view
 
 PARAMS = ParallaxParams()
 
@@ -77,3 +78,19 @@ def test_exposure_that_changes_is_no_motion(gain: float, offset: float) -> None:
     field = guided(changed)
     assert field.believed.sum() > 0.75 * guided(seen).believed.sum()
     assert np.median(whitened_error(changed, field)) < 1.8
+
+
+def test_fine_even_texture_that_is_matched_at_a_wrong_place_is_not_believed() -> None:
+    noise = np.random.default_rng(4).normal(128.0, 60.0, (240, 400)).astype(np.float32)
+    wall = np.clip(cv2.GaussianBlur(noise, (0, 0), 1.2) * 3.0 - 256.0, 0, 255).astype(np.uint8)
+    # The wall moved by 30 px; whoever looks for it where it would be if it were far finds some texture, and finds his way back.
+    earlier, later = np.ascontiguousarray(wall[:, :320]), np.ascontiguousarray(wall[:, 30:350])
+    forwards = first_look(corridor_view())
+    still = replace(forwards, later_from_earlier=np.eye(3), correction=np.eye(3))
+    far = sweep_depth(earlier, later, CAMERA, np.eye(3), forwards.direction_later, PARAMS)
+    far = replace(far, inverse_depth=np.zeros_like(far.inverse_depth))
+    lax = PARAMS.model_copy(update={"unlike_share": 10.0})
+    believed = measure_guided_flow(earlier, later, CAMERA, np.eye(3), still, far, PARAMS).believed.mean()
+    without = measure_guided_flow(earlier, later, CAMERA, np.eye(3), still, far, lax).believed.mean()
+    assert without > 0.05
+    assert believed < 0.5 * without

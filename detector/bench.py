@@ -15,10 +15,15 @@ Measured on every pair of a stream, each with frames that are as a camera gives 
     The Lucas-Kanade calls alone, there and back, on the very points that ``other`` started from, with its window, levels and iterations, on plain arrays.
 ``parallax``
     The method ``parallax`` in a stream, without poses: one frame prepared, one pair answered, rotation and direction of travel from the flow. With an attitude it takes less.
+``parallax_poses``
+    The same with the poses, where the frames have them: where a pose says which way the camera went, the first look is at a smaller picture.
+``flow_balance``, ``line_vp``
+    Rivals for scale (:mod:`detector.evaluation.methods`), from two plain frames to the answer, or to knowing that there is none. The third, the middle of the image, takes no time that
+    could be measured.
 ``sfm``
     Two-view structure from motion (:mod:`detector.two_view`), which the paper compares its time with.
 
-The order of the seven turns from pair to pair, so that caches and other load on the machine favour none of them.
+The order of the turns changes from pair to pair, so that caches and other load on the machine favour none of them.
 
 Time is elapsed time, or processor time of all threads where the machine has other work to do (:data:`CLOCKS`): then a busy machine costs caches, not waiting.
 """
@@ -32,7 +37,6 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any, Final
@@ -40,46 +44,20 @@ from typing import Any, Final
 import cv2
 import numpy as np
 import sklearn
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from detector import flow, two_view
 from detector.bench_frames import Stream
 from detector.bench_memory import peak_memory
-from detector.camera_model import CameraModel
-from detector.parallax.pipeline import Intrinsics, ParallaxDetector
+from detector.bench_paths import SERIES, Clock, Paths, Samples
 from detector.params import DetectorParams
-from detector.pipeline import VoidDetector
-from detector.results import Detection, Direction, SinglePlane
 
-Clock = Callable[[], float]
 CLOCKS: Final[Mapping[str, Clock]] = MappingProxyType({"wall": time.perf_counter, "cpu": time.process_time})
 """Seconds by name: as on the wall, or those that the processors spent on this process."""
-SERIES: Final = ("literal", "literal_other", "first", "other", "floor", "parallax", "sfm")
+OVER_FLOOR: Final = ("other", "parallax", "parallax_poses", "flow_balance", "line_vp")
+"""What is given as a multiple of the Lucas-Kanade calls alone (``floor``)."""
 _LITERAL_FILE: Final = Path(__file__).parents[1] / "tests" / "reference" / "paper.py"
-_ASSUMED_HFOV_DEG: Final = 80.0
-"""For structure from motion, which needs a camera; its time hardly depends on which."""
-_FEWEST_POINTS: Final = 10
 _POINT_CAPS: Final = (150, 300, 500, 800, 1200)
 """Of the curve over the number of points."""
-
-
-@dataclass(slots=True)
-class Samples:
-    """Seconds of one size: a list for each of :data:`SERIES`, entry by entry of the same pair and repeat; None where there was no answer."""
-
-    seconds: dict[str, list[float | None]] = field(default_factory=lambda: {name: [] for name in SERIES})
-    steps: dict[str, list[dict[str, float]]] = field(
-        default_factory=lambda: {name: [] for name in ("first", "other", "parallax", "sfm")}
-    )
-    points: dict[str, list[int]] = field(default_factory=lambda: {name: [] for name in ("first", "other")})
-    renewal_s: list[float] = field(default_factory=list)
-    kinds: dict[str, dict[str, int]] = field(default_factory=lambda: {name: {} for name in SERIES})
-
-    def note(self, series: str, seconds: float | None, kind: str) -> None:
-        """Add one sample and the kind of its answer."""
-        self.seconds[series].append(seconds)
-        self.kinds[series][kind] = self.kinds[series].get(kind, 0) + 1
 
 
 def literal_reference() -> ModuleType | None:
@@ -191,7 +169,7 @@ def measure(
     clock
         Gives seconds.
     """
-    paths = _Paths(stream, params, literal, series, clock)
+    paths = Paths(stream, params, literal, series, clock)
     for pair in range(1, len(stream) - 1):  # what is slow once only: imports, caches, memory that grows
         paths.warm_up(pair)
     samples = Samples()
@@ -239,156 +217,6 @@ def limited_threads(count: int) -> Iterator[None]:
             cv2.setNumThreads(opencv)
 
 
-class _Paths:
-    """The series on one stream. Pair i is (frame i, frame i + 1)."""
-
-    def __init__(
-        self,
-        stream: Stream,
-        params: DetectorParams,
-        literal: ModuleType | None,
-        series: Sequence[str],
-        clock: Clock,
-    ) -> None:
-        self._clock = clock
-        self._stream, self._params, self._literal = stream, params, literal
-        self._warmed = [
-            name for name in ("other", "first", "parallax", "sfm") if name in series
-        ]  # literal is, below
-        height, width = stream[0].shape
-        self._camera = CameraModel.from_hfov(width, height, _ASSUMED_HFOV_DEG)
-        self._kept: Any = None
-        if literal is not None:
-            self._settings = literal.settings_of(params)
-            self._starts = literal.random_starts(params.seed, params.kmeans_restarts)
-            for pair in range(len(stream) - 1):  # the first that leads to clusters
-                answer = self._literal_answer(pair, None)
-                if answer.k is not None:
-                    self._kept = literal.Kept(answer.p, answer.n, answer.k)
-                    break
-        self._points: dict[int, NDArray[np.float32]] = {}
-        self.begin()
-
-    def begin(self) -> None:
-        """Start the stream anew: the first pair is our first loop and is not counted."""
-        self._detector = VoidDetector(self._params, timer=self._clock)
-        self._earlier = self._detector.prepare(self._stream[0])
-        later = self._detector.prepare(self._stream[1])
-        self._detector.detect(self._earlier, later)
-        self._detector.renew(later)
-        self._earlier = later
-        self._parallax = ParallaxDetector(frame_params=self._params, timer=self._clock)
-        self._parallax_earlier = self._parallax.prepare(self._stream[1])
-
-    def warm_up(self, pair: int) -> None:
-        """Run once what is measured later; this also finds the points that the other loops start from."""
-        samples = Samples()
-        for series in self._warmed:
-            self.sample(series, pair, samples)
-
-    def sample(self, series: str, pair: int, samples: Samples) -> None:
-        """Run one series on one pair and note its time."""
-        earlier, later = self._stream[pair], self._stream[pair + 1]
-        if series in ("literal", "literal_other"):
-            kept = self._kept if series == "literal_other" else None
-            if self._literal is None or (series == "literal_other" and kept is None):
-                samples.note(series, None, "not_run")
-                return
-            begin = self._clock()
-            answer = self._literal_answer(pair, kept)
-            seconds = self._clock() - begin
-            answered = answer.kind in ("vanishing_point", "lowest_flow", "single_plane")
-            samples.note(series, seconds if answered else None, answer.kind)
-        elif series in ("first", "other"):
-            self._our_loop(series, pair, samples)
-        elif series == "parallax":
-            self._parallax_loop(pair, samples)
-        elif series == "floor":
-            points = self._points.get(pair)
-            if points is None or len(points) < _FEWEST_POINTS:
-                samples.note(series, None, "no_points")
-                return
-            begin = self._clock()
-            lucas_kanade_alone(earlier, later, points, self._params)
-            samples.note(series, self._clock() - begin, "tracked")
-        else:
-            begin = self._clock()
-            found = two_view.reconstruct(earlier, later, self._camera, timer=self._clock)
-            seconds = self._clock() - begin
-            samples.note(series, seconds if found.failure is None else None, found.failure or "reconstructed")
-            if found.failure is None:
-                samples.steps["sfm"].append(dict(found.seconds))
-
-    def _our_loop(self, series: str, pair: int, samples: Samples) -> None:
-        image_a, image_b = self._stream[pair], self._stream[pair + 1]
-        begin = self._clock()
-        if series == "first":
-            detector = VoidDetector(self._params, timer=self._clock)
-            earlier = detector.prepare(image_a)
-        else:
-            detector, earlier = self._detector, self._earlier
-        later = detector.prepare(image_b)
-        prepared = self._clock()
-        detection = detector.detect(earlier, later).detection
-        end = self._clock()
-        if series == "other":
-            begin_renewal = self._clock()
-            detector.renew(later)
-            samples.renewal_s.append(self._clock() - begin_renewal)
-            self._earlier = later
-            if earlier.seeds_px is not None:
-                self._points[pair] = earlier.seeds_px
-        answered = isinstance(detection, Direction | SinglePlane)
-        samples.note(series, end - begin if answered else None, _kind_of(detection))
-        if answered:
-            steps = dict(detection.diagnostics.seconds)
-            steps["frames"] = steps.get("frames", 0.0) + prepared - begin
-            samples.steps[series].append(steps)
-            samples.points[series].append(0 if earlier.seeds_px is None else len(earlier.seeds_px))
-
-    def _parallax_loop(self, pair: int, samples: Samples) -> None:
-        begin = self._clock()
-        later = self._parallax.prepare(self._stream[pair + 1])
-        prepared = self._clock()
-        intrinsics = Intrinsics(self._camera, "assumed")
-        detection = self._parallax.detect(self._parallax_earlier, later, intrinsics=intrinsics).detection
-        end = self._clock()
-        self._parallax_earlier = later
-        answered = isinstance(detection, Direction | SinglePlane)
-        samples.note("parallax", end - begin if answered else None, _kind_of(detection))
-        if answered:
-            steps = dict(detection.diagnostics.seconds)
-            steps["frames"] = steps.get("frames", 0.0) + prepared - begin
-            samples.steps["parallax"].append(steps)
-
-    def _literal_answer(self, pair: int, kept: Any) -> Any:
-        literal = self._literal
-        assert literal is not None  # noqa: S101 - callers have looked
-        return literal.void_of_pair(
-            self._stream[pair], self._stream[pair + 1], self._starts, self._settings, kept
-        )
-
-
-def lucas_kanade_alone(
-    earlier: NDArray[np.uint8],
-    later: NDArray[np.uint8],
-    points_px: NDArray[np.float32],
-    params: DetectorParams,
-) -> None:
-    """Track points there and back with the detector's settings and do nothing with the outcome: the floor of any such method."""
-    at = points_px
-    for a, b in ((earlier, later), (later, earlier)):
-        at, _ = flow.track(
-            a,
-            b,
-            at,
-            window_px=params.lk_window_px,
-            levels=params.lk_levels,
-            iterations=params.lk_iterations,
-            epsilon_px=params.lk_epsilon_px,
-        )
-
-
 def machine() -> dict[str, Any]:
     """Return what the figures were measured on."""
     return {
@@ -413,7 +241,7 @@ def _summary(samples: Samples, memory: dict[str, float | None]) -> dict[str, Any
         "renewal_s": _spread(samples.renewal_s),
         "literal_over_first": _ratio(seconds["literal"], seconds["first"]),
         "literal_over_other": _ratio(seconds["literal_other"], seconds["other"]),
-        "other_over_floor": _ratio(seconds["other"], seconds["floor"]),
+        **{f"{name}_over_floor": _ratio(seconds[name], seconds["floor"]) for name in OVER_FLOOR},
         "sfm_over_first": _ratio(seconds["sfm"], seconds["first"]),
         "sfm_over_other": _ratio(seconds["sfm"], seconds["other"]),
         **memory,
@@ -458,12 +286,6 @@ def _step_spread(steps: Sequence[dict[str, float]]) -> dict[str, dict[str, float
 
 def _median(values: Sequence[float]) -> float | None:
     return float(np.median(values)) if values else None
-
-
-def _kind_of(detection: Detection) -> str:
-    if isinstance(detection, Direction):
-        return detection.kind.value
-    return "single_plane" if isinstance(detection, SinglePlane) else detection.reason.value
 
 
 def _load_average() -> float | None:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Stream = tuple[NDArray[np.uint8], ...]
-"""Frames of one camera in order, each paired with the one before; (H, W) uint8, all of one size."""
+from detector.camera_model import CameraModel
+from detector.observer import CameraPose
 
 _HFOV_DEG: Final = 80.0
 _HALF_WIDTH_M: Final = 1.1
@@ -25,6 +26,40 @@ _LEVELS: Final = 6
 _NOISE_GREY: Final = 1.5
 _SURFACES: Final = ((1.0, 3), (0.85, 4), (1.25, 5), (0.6, 6), (0.95, 7))
 """Brightness and seed of the left wall, the right wall, the ceiling, the floor and the end."""
+_WORLD_FROM_CAMERA: Final = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+"""A level camera that looks along the corridor, in a world of x along it, y to the right, z down."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """Frames of one camera in order, each paired with the one before.
+
+    Attributes
+    ----------
+    frames
+        (H, W) uint8, all of one size.
+    camera
+        Of that size; None where it is not known.
+    poses
+        One a frame; empty where they are not known.
+    """
+
+    frames: tuple[NDArray[np.uint8], ...]
+    camera: CameraModel | None = None
+    poses: tuple[CameraPose, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.poses and len(self.poses) != len(self.frames):
+            raise ValueError(f"expected {len(self.frames)} poses, one a frame, got {len(self.poses)}")
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> NDArray[np.uint8]:
+        return self.frames[index]
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        return iter(self.frames)
 
 
 def generated_stream(size_px: tuple[int, int], count: int) -> Stream:
@@ -42,38 +77,69 @@ def generated_stream(size_px: tuple[int, int], count: int) -> Stream:
     if count < 2:
         raise ValueError(f"a stream needs at least two frames, got {count}")
     textures = [_mip_levels(seed) for _, seed in _SURFACES]
-    return tuple(_corridor(size_px, _STEP_M * index, index, textures) for index in range(count))
+    axes = np.array(_WORLD_FROM_CAMERA)
+    return Stream(
+        tuple(_corridor(size_px, _STEP_M * index, index, textures) for index in range(count)),
+        CameraModel.from_hfov(*size_px, _HFOV_DEG),
+        tuple(CameraPose(axes, np.array([_STEP_M * index, 0.0, 0.0])) for index in range(count)),
+    )
 
 
-def resized_stream(frames: Sequence[NDArray[np.uint8]], size_px: tuple[int, int]) -> Stream:
-    """Return frames cut about their middle to another shape, and brought to a size.
+def resized_stream(given: Stream, size_px: tuple[int, int]) -> Stream:
+    """Return frames cut about their middle to another shape, and brought to a size; their camera with them.
 
     Parameters
     ----------
-    frames
-        (H, W) uint8.
+    given
+        Frames, of the size that their camera says where that is known.
     size_px
         Width and height.
+
+    Raises
+    ------
+    detector.camera_model.CameraError
+        The camera's middle is cut off.
     """
-    return tuple(_fitted(frame, size_px) for frame in frames)
+    frames = tuple(_fitted(frame, size_px) for frame in given)
+    if given.camera is None:
+        return replace(given, frames=frames)
+    left, top, part_width, part_height = _part(given[0], size_px)
+    camera = replace(
+        given.camera,
+        width_px=part_width,
+        height_px=part_height,
+        cx_px=given.camera.cx_px - left,
+        cy_px=given.camera.cy_px - top,
+    )
+    return replace(given, frames=frames, camera=camera.scaled_to(*size_px))
 
 
-def there_and_back(frames: Stream, count: int) -> Stream:
+def there_and_back(given: Stream, count: int) -> Stream:
     """Return at least ``count`` frames: the stream, then back through it, and so on; a single pair becomes a stream that way."""
-    turn = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
-    return tuple(frames[turn[i % len(turn)]] for i in range(max(count, len(frames))))
+    turn = [*range(len(given)), *range(len(given) - 2, 0, -1)]
+    order = [turn[i % len(turn)] for i in range(max(count, len(given)))]
+    return replace(
+        given,
+        frames=tuple(given.frames[index] for index in order),
+        poses=tuple(given.poses[index] for index in order) if given.poses else (),
+    )
 
 
-def _fitted(frame: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
+def _part(frame: NDArray[np.uint8], size_px: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of the largest part about the middle that has the shape of a size."""
     width, height = size_px
     scale = max(width / frame.shape[1], height / frame.shape[0])
     part_width = min(frame.shape[1], max(1, round(width / scale)))
     part_height = min(frame.shape[0], max(1, round(height / scale)))
-    left, top = (frame.shape[1] - part_width) // 2, (frame.shape[0] - part_height) // 2
+    return (frame.shape[1] - part_width) // 2, (frame.shape[0] - part_height) // 2, part_width, part_height
+
+
+def _fitted(frame: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    left, top, part_width, part_height = _part(frame, size_px)
     part = frame[top : top + part_height, left : left + part_width]
-    if part.shape == (height, width):
+    if (part_width, part_height) == size_px:
         return np.ascontiguousarray(part)
-    way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    way = cv2.INTER_AREA if size_px[0] < part_width else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(part, size_px, interpolation=way), np.uint8)
 
 

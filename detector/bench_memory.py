@@ -44,7 +44,7 @@ def peak_memory(stream: Stream, params: DetectorParams) -> dict[str, float | Non
     """
     with tempfile.TemporaryDirectory(prefix="detector-bench-") as folder:
         file = Path(folder) / "frames.npy"
-        np.save(file, np.stack(stream))
+        np.save(file, np.stack(stream.frames))
         child = subprocess.run(
             [sys.executable, "-m", "detector.bench_memory", str(file)],
             input=params.model_dump_json(),

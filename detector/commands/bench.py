@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from detector.commands import inputs
+from detector.commands.clips import poses_beside
 from detector.commands.inputs import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from detector.bench_frames import Stream
+    from detector.camera_model import CameraModel
+    from detector.observer import CameraPose
 
 _DESCRIPTION: Final = """\
 Measure seconds and memory on this machine: all that is compared runs in turns on the same frames.
@@ -34,8 +36,11 @@ what is measured (seconds; a pair without an answer does not count)
   other                    our other loops in a stream: one frame prepared, one pair answered, p, n and k kept
   floor                    Lucas-Kanade alone, there and back, on the points that other started from
   parallax                 the method parallax in a stream without poses: one frame prepared, one pair answered
+  parallax_poses           the same told the poses, where the frames have them: the corridor, and a DIR with a groundtruth.json or poses.json
+  flow_balance, line_vp    rivals for scale, from two plain frames; their time counts with and without an answer, they have looked either way
+                           (the third rival, the middle of the image, has nothing to measure)
   sfm                      two-view structure from motion
-Ratios are medians over the pairs of the ratio on each pair.
+Ratios are medians over the pairs of the ratio on each pair; the methods and rivals are given as multiples of the floor.
 
 JSON keys: docs/performance.md
 
@@ -111,6 +116,7 @@ def figures_of(options: argparse.Namespace) -> dict[str, Any]:
         The frames or parameters cannot be used.
     """
     from detector import bench, bench_frames
+    from detector.camera_model import CameraError
 
     params = inputs.params_of(options)
     if options.exact:
@@ -123,11 +129,14 @@ def figures_of(options: argparse.Namespace) -> dict[str, Any]:
             )
     count = max(options.count, 3)
     if options.frames:
-        images, source = _given(options.frames, count)
-        streams = {
-            size: bench_frames.there_and_back(bench_frames.resized_stream(images, size), _FEWEST_FRAMES)
-            for size in sizes
-        }
+        given, source = _given(options.frames, count)
+        try:
+            streams = {
+                size: bench_frames.there_and_back(bench_frames.resized_stream(given, size), _FEWEST_FRAMES)
+                for size in sizes
+            }
+        except CameraError as error:
+            raise InputError(inputs.one_line(f"{options.frames[0]}: K: {error}")) from error
     else:
         streams = {size: bench_frames.generated_stream(size, count) for size in sizes}
         source = "generated corridor"
@@ -148,10 +157,10 @@ def table_of(figures: dict[str, Any]) -> str:
     blocks = {str(figures["threads"]): figures["sizes"], **figures["more_threads"]}
     lines = [
         (
-            "| size | threads | literal first, other | ours first | ours other, p95 | then renewal, p95 | LK floor | parallax, p95 | SfM | literal / first | literal / other "
-            "| other / floor | peak |"
+            "| size | threads | literal first, other | ours first | ours other, p95 | then renewal, p95 | LK floor | parallax, p95 | parallax with poses, p95 | flow balance, p95 | line VP, p95 "
+            "| SfM | literal / first | literal / other | other / floor | parallax, with poses / floor | flow balance, line VP / floor | peak |"
         ),
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "|---" * 18 + "|",
     ]
     for threads, sizes in blocks.items():
         for size, row in sizes.items():
@@ -163,11 +172,20 @@ def table_of(figures: dict[str, Any]) -> str:
                 f"{_ms(row['other_s'])}, {_ms(row['other_s'], 'p95')}",
                 f"{_ms(row['renewal_s'])}, {_ms(row['renewal_s'], 'p95')}",
                 _ms(row["floor_s"]),
-                f"{_ms(row['parallax_s'])}, {_ms(row['parallax_s'], 'p95')}",
+                *(
+                    f"{_ms(row[f'{name}_s'])}, {_ms(row[f'{name}_s'], 'p95')}"
+                    for name in ("parallax", "parallax_poses", "flow_balance", "line_vp")
+                ),
                 _ms(row["sfm_s"]),
                 *(
-                    "-" if row[key] is None else f"{row[key]:.1f}"
-                    for key in ("literal_over_first", "literal_over_other", "other_over_floor")
+                    ", ".join(_times(row[key]) for key in keys)
+                    for keys in (
+                        ("literal_over_first",),
+                        ("literal_over_other",),
+                        ("other_over_floor",),
+                        ("parallax_over_floor", "parallax_poses_over_floor"),
+                        ("flow_balance_over_floor", "line_vp_over_floor"),
+                    )
                 ),
                 "-" if row["peak_mb"] is None else f"{row['peak_mb']:.0f} MB",
             ]
@@ -201,8 +219,12 @@ def _run(options: argparse.Namespace) -> int:
 # ---------------------------------------------------------------------- input
 
 
-def _given(paths: list[Path], count: int) -> tuple[list[NDArray[np.uint8]], str]:
-    """Return the images that the command line names, and how to call them."""
+def _given(paths: list[Path], count: int) -> tuple[Stream, str]:
+    """Return the images that the command line names, with what is known of them, and how to call them."""
+    from detector.bench_frames import Stream
+
+    camera: CameraModel | None = None
+    poses: dict[str, CameraPose] = {}
     if len(paths) == 1 and not paths[0].exists():
         raise InputError(f"{paths[0]}: cannot be read: No such file or directory")
     if len(paths) == 1 and paths[0].is_dir():
@@ -212,6 +234,7 @@ def _given(paths: list[Path], count: int) -> tuple[list[NDArray[np.uint8]], str]
         folder = paths[0].resolve()
         name = folder.parent.name if folder.name == "images" else folder.name
         source = f"{name}, {len(files)} frames, resized"
+        camera, poses = poses_beside(paths[0])
     elif len(paths) == 2 and not any(path.is_dir() for path in paths):
         files, source = paths, f"{paths[0].name} and {paths[1].name} there and back, resized"
     else:
@@ -225,7 +248,14 @@ def _given(paths: list[Path], count: int) -> tuple[list[NDArray[np.uint8]], str]
                 f"{file}: found {image.shape[1]} x {image.shape[0]} px, {files[0].name} has "
                 f"{images[0].shape[1]} x {images[0].shape[0]}"
             )
-    return images, source
+    size = (images[0].shape[1], images[0].shape[0])
+    if camera is not None and (camera.width_px, camera.height_px) != size:
+        raise InputError(
+            f"{files[0]}: found {size[0]} x {size[1]} px, its K is for {camera.width_px} x {camera.height_px}"
+        )
+    of_files = [poses.get(file.name) for file in files]
+    known = tuple(pose for pose in of_files if pose is not None)
+    return Stream(tuple(images), camera, known if len(known) == len(files) else ()), source
 
 
 def _files_of(folder: Path) -> list[Path]:
@@ -280,3 +310,7 @@ def _say(what: str) -> None:
 
 def _ms(spread: dict[str, float] | None, which: str = "median") -> str:
     return "-" if spread is None else f"{spread[which] * _MS:.1f}"
+
+
+def _times(ratio: float | None) -> str:
+    return "-" if ratio is None else f"{ratio:.1f}"

@@ -201,7 +201,28 @@ def _images_of(folder: Path) -> list[Path]:
 def poses_of(clip: FolderClip) -> tuple[CameraModel | None, dict[str, CameraPose]]:
     """Return the camera and the poses by file name that a folder's ``groundtruth.json`` or ``poses.json`` holds, if it has one.
 
-    The file lies beside the images, or beside their folder when that is called ``images``.
+    Raises
+    ------
+    InputError
+        There is such a file and it cannot be used.
+    """
+    try:
+        return poses_beside(clip.folder)
+    except InputError as error:
+        raise InputError(f"{error} (--no-poses leaves it aside)") from error
+
+
+def known_beside(folder: Path, *names: str) -> Path | None:
+    """Return the first of these files that lies beside the images of a folder, or beside the folder when that is called ``images``."""
+    folders = [folder] + ([folder.parent] if folder.name == "images" else [])
+    files = [each / name for each in folders for name in names]
+    return next((file for file in files if file.is_file()), None)
+
+
+def poses_beside(folder: Path) -> tuple[CameraModel | None, dict[str, CameraPose]]:
+    """Return the camera and the poses, by file name, of images in a folder (:func:`known_beside`); neither where no file says them.
+
+    The poses' world is turned so that its z axis points down, where it can be told which way that is.
 
     Raises
     ------
@@ -213,15 +234,13 @@ def poses_of(clip: FolderClip) -> tuple[CameraModel | None, dict[str, CameraPose
     from detector.evaluation.dataset import POSES_FILE, TRUTH_FILE, DatasetError, load_truth
     from detector.observer import CameraPose
 
-    folders = [clip.folder] + ([clip.folder.parent] if clip.folder.name == "images" else [])
-    files = [folder / name for folder in folders for name in (TRUTH_FILE, POSES_FILE)]
-    found = next((file for file in files if file.is_file()), None)
+    found = known_beside(folder, TRUTH_FILE, POSES_FILE)
     if found is None:
         return None, {}
     try:
         known = load_truth(found)
     except DatasetError as error:
-        raise InputError(inputs.one_line(f"{error} (--no-poses leaves it aside)")) from error
+        raise InputError(inputs.one_line(error)) from error
     poses: dict[str, CameraPose] = {}
     level_from_world = known.level_from_world()
     level = np.eye(3) if level_from_world is None else level_from_world

@@ -1,4 +1,4 @@
-"""The picture of ``detector bench``: time against the size of the image, and against the number of points."""
+"""The picture of ``detector bench``: time against the size of the image, of the whole comparison and of the methods alone, and against the number of points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from detector.drawing.palette import (
     ORANGE,
     Colour,
 )
-from detector.drawing.sheet import side_by_side
+from detector.drawing.sheet import one_below_the_other, side_by_side
 
 _PANEL_PX: Final = (760, 520)
 _MS: Final = 1e3
@@ -31,30 +31,43 @@ _LINES: Final[tuple[tuple[str, str, Colour], ...]] = (
     ("other", "other loops", CHART_BLUE),
     ("floor", "Lucas-Kanade alone", CHART_GREEN),
 )
+_METHODS: Final[tuple[tuple[str, str, Colour], ...]] = (
+    ("parallax", "parallax", ORANGE),
+    ("parallax_poses", "parallax with poses", CHART_VERMILLION),
+    ("flow_balance", "left-right flow balance", CHART_PURPLE),
+    ("other", "paper, other loops", CHART_BLUE),
+    ("floor", "Lucas-Kanade alone", CHART_GREEN),
+    ("line_vp", "lines alone", GREY),
+)
+"""The literal path and structure from motion would press these together."""
 
 
 def performance_chart(figures: dict[str, Any]) -> NDArray[np.uint8]:
     """Return the chart of the figures of :func:`detector.bench.run`, (H, W, 3) uint8 BGR."""
-    return side_by_side(
-        [draw_chart(_against_size(figures), *_PANEL_PX), draw_chart(_against_points(figures), *_PANEL_PX)]
+    charts = (
+        _against_size(figures, "Time of one pair", _LINES),
+        _against_points(figures),
+        _against_size(figures, "Methods and rivals", _METHODS),
     )
+    whole, points, methods = (draw_chart(chart, *_PANEL_PX) for chart in charts)
+    return one_below_the_other([side_by_side([whole, points]), methods])
 
 
-def _against_size(figures: dict[str, Any]) -> Chart:
+def _against_size(figures: dict[str, Any], title: str, lines: tuple[tuple[str, str, Colour], ...]) -> Chart:
     sizes = sorted(figures["sizes"].items(), key=lambda item: _megapixels(item[0]))
     x = np.array([_megapixels(name) for name, _ in sizes])
     series = []
-    for key, name, colour in _LINES:
+    for key, name, colour in lines:
         spreads = [row[f"{key}_s"] for _, row in sizes]
         if all(spread is None for spread in spreads):
             continue
         y = np.array([np.nan if spread is None else spread["median"] * _MS for spread in spreads])
         series.append(Series(x, y, colour, name))
-    names = ", ".join(name for name, _ in sizes)
+    sides = ", ".join(name for name, _ in sizes)
     threads = figures["threads"]
     return Chart(
-        f"Time of one pair, {threads} thread{'' if threads == 1 else 's'} (medians)",
-        f"size (megapixels): {names}",
+        f"{title}, {threads} thread{'' if threads == 1 else 's'} (medians)",
+        f"size (megapixels): {sides}",
         "time (ms)",
         series,
     )

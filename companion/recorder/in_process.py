@@ -15,14 +15,14 @@ from companion.errors import CompanionError
 from companion.io.feed import Feed
 from companion.io.messages import Answer, Kind, Message, Wants
 from companion.io.receiver import Receiver
-from companion.recorder.recording import CHUNK_BYTES
+from companion.recorder.recording import ChunkLimits
 from companion.recorder.sink import Recorder, wants_of
 
 _DRAIN_NS: Final = 20_000_000
 _EPOCH_NS: Final = 1_767_225_600_000_000_000
 """2026-01-01: simulated time has no date of its own, and the same flight makes the same file."""
 _LEAN: Final = frozenset({Kind.FRAME, Kind.DETECTION, Kind.STATE, Kind.LOOP, Kind.CONFIG, Kind.MAVLINK})
-_LARGE_CHUNK_BYTES: Final = 1 << 22
+_LEAN_CHUNKS: Final = ChunkLimits(1 << 22, None)
 
 
 class InProcessRecorder:
@@ -54,7 +54,7 @@ class InProcessRecorder:
             self._desk,
             folder=folder,
             wall_offset_ns=_EPOCH_NS,
-            chunk_bytes=_LARGE_CHUNK_BYTES if is_lean else CHUNK_BYTES,
+            chunks=_LEAN_CHUNKS if is_lean else ChunkLimits(),
         )
         self._recorder.start()
 

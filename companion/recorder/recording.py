@@ -6,6 +6,7 @@ import contextlib
 import json
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final, cast
 
@@ -14,12 +15,28 @@ from mcap.writer import CompressionType, Writer
 from companion.config.recorder import RecorderConfig
 from companion.io.messages import Kind, Message
 from companion.recorder import topics
+from companion.recorder.chunk_index import pack_index_of
 from companion.recorder.disk import GrowingFile
 from companion.recorder.frames import Frames
 
-CHUNK_BYTES: Final = 16 * 1024
-"""Small: what is in an unfinished chunk is lost when we die. In flight that is a fraction of a second."""
+_TLOG_BYTES: Final = 16 * 1024
 _TLOG_TIME: Final = struct.Struct(">Q")
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkLimits:
+    """When a chunk is full: compressed and written together. What is in an unfinished one is lost when we die.
+
+    Attributes
+    ----------
+    size_bytes
+        Of what is in it. Smaller: less is lost, and the index of a file, which is kept in memory until its end, is longer.
+    span_s
+        From its first message to the one that ends it, by the messages' own times; None: whatever it takes.
+    """
+
+    size_bytes: int = 128 * 1024
+    span_s: float | None = 1.0
 
 
 class McapFile:
@@ -35,8 +52,8 @@ class McapFile:
         Wall time less our monotonic time.
     about
         Metadata: how the recording began, by whom.
-    chunk_bytes
-        Compressed and written together.
+    chunks
+        When a chunk is full.
 
     Raises
     ------
@@ -50,11 +67,18 @@ class McapFile:
         config: RecorderConfig,
         offset_ns: int,
         about: Mapping[str, str],
-        chunk_bytes: int = CHUNK_BYTES,
+        chunks: ChunkLimits,
     ) -> None:
         self._frames = Frames(config)
         self._offset_ns = offset_ns
-        self._writer = Writer(cast("IO[Any]", file), chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+        self._writer = Writer(
+            cast("IO[Any]", file), chunk_size=chunks.size_bytes, compression=CompressionType.ZSTD
+        )
+        pack_index_of(self._writer)
+        self._span_ns = None if chunks.span_s is None else round(chunks.span_s * 1e9)
+        self._chunk_begin_ns: int | None = None
+        self._file = file
+        self._written_bytes = 0
         self._channels: dict[str, int] = {}
         self._writer.start(profile="", library="void-companion")
         self._writer.add_metadata(topics.METADATA, {**about, "monotonic_to_wall_ns": str(offset_ns)})
@@ -64,6 +88,20 @@ class McapFile:
 
     def write(self, message: Message) -> None:
         """Write one message; kinds that are not recorded are left out."""
+        self._write(message)
+        if self._span_ns is None:
+            return
+        # By the messages' times, not the clock's: the same flight makes the same file. An exposure may be older than the chunk.
+        if self._written_bytes != self._file.tell():  # a chunk was full
+            self._written_bytes = self._file.tell()
+            self._chunk_begin_ns = None
+        if self._chunk_begin_ns is None:
+            self._chunk_begin_ns = message.time_ns
+        elif message.time_ns - self._chunk_begin_ns >= self._span_ns:
+            self._writer.flush()  # type: ignore[no-untyped-call]  # the library has it without a type
+            self._chunk_begin_ns = None
+
+    def _write(self, message: Message) -> None:
         wall_ns = message.time_ns + self._offset_ns
         match message.kind:
             case Kind.FRAME:
@@ -155,7 +193,7 @@ class TlogFile:
         stamp = _TLOG_TIME.pack((message.time_ns + self._offset_ns) // 1000)
         for frame in frames_of(message.data):
             self._waiting += stamp + frame
-        if len(self._waiting) > CHUNK_BYTES:
+        if len(self._waiting) > _TLOG_BYTES:
             self.flush()
 
     def flush(self) -> None:
@@ -193,8 +231,8 @@ class OpenRecording:
         Metadata.
     autopilot_links
         Numbers of the links whose MAVLink goes into the tlog.
-    chunk_bytes
-        Compressed and written together.
+    chunks
+        When a chunk is full.
 
     Raises
     ------
@@ -209,13 +247,13 @@ class OpenRecording:
         offset_ns: int,
         about: Mapping[str, str],
         autopilot_links: frozenset[int],
-        chunk_bytes: int = CHUNK_BYTES,
+        chunks: ChunkLimits,
     ) -> None:
         self._autopilot_links = autopilot_links
         self._files = [GrowingFile(name.with_name(name.name + ".mcap"))]
         self._tlog: TlogFile | None = None
         try:
-            self._mcap = McapFile(self._files[0], config, offset_ns, about, chunk_bytes)
+            self._mcap = McapFile(self._files[0], config, offset_ns, about, chunks)
             if config.tlog:
                 self._files.append(GrowingFile(name.with_name(name.name + ".tlog")))
                 self._tlog = TlogFile(self._files[1], offset_ns)

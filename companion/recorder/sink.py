@@ -17,7 +17,7 @@ import cv2
 from companion.config import Config
 from companion.io.sink import Desk, Kind, Message, Sink, Wants
 from companion.recorder.disk import MIB, Limits, make_room, new_name
-from companion.recorder.recording import CHUNK_BYTES, OpenRecording
+from companion.recorder.recording import ChunkLimits, OpenRecording
 
 ALWAYS_KINDS: Final = frozenset(Kind) - {Kind.DETAILS, Kind.RING, Kind.ANSWER}
 _HELD: Final = frozenset({Kind.CONFIG, Kind.STATE, Kind.LINK})
@@ -64,8 +64,8 @@ class Recorder:
         Time for what is due by time.
     wall_offset_ns
         Wall time less the service's monotonic time; None: as this machine's clocks say when a file begins.
-    chunk_bytes
-        Compressed and written together: what of it is not full is lost when we die.
+    chunks
+        When what is compressed and written together is full.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Recorder:
         folder: Path | None = None,
         monotonic_s: Callable[[], float] = time.monotonic,
         wall_offset_ns: int | None = None,
-        chunk_bytes: int = CHUNK_BYTES,
+        chunks: ChunkLimits | None = None,
     ) -> None:
         self._config = config.recorder
         self._wants = wants_of(config)
@@ -84,7 +84,7 @@ class Recorder:
         self._folder = folder if folder is not None else folder_of(config, os.environ)
         self._monotonic_s = monotonic_s
         self._wall_offset_ns = wall_offset_ns
-        self._chunk_bytes = chunk_bytes
+        self._chunks = ChunkLimits() if chunks is None else chunks
         self._limits = Limits(
             round(self._config.file_mib * MIB),
             round(self._config.total_mib * MIB),
@@ -191,7 +191,7 @@ class Recorder:
         }
         name = new_name(self._folder, time.time_ns())
         self._recording = OpenRecording(
-            name, self._config, offset_ns, about, self._autopilot_links, self._chunk_bytes
+            name, self._config, offset_ns, about, self._autopilot_links, self._chunks
         )
         for message in self._held.values():
             self._recording.write(message)

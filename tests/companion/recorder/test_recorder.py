@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import os
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 from pymavlink import mavutil
 
 from companion.config import Config
+from companion.config.recorder import RecorderConfig
 from companion.config_file import parse_config
 from companion.errors import ConfigError
 from companion.io.messages import Answer, Kind, Message
 from companion.recorder import topics
-from companion.recorder.disk import MIB, Limits, make_room, new_name, recordings
+from companion.recorder.disk import MIB, GrowingFile, Limits, make_room, new_name, recordings
 from companion.recorder.reading import RecordingError, RecordingFile
+from companion.recorder.recording import ChunkLimits, McapFile
 from companion.recorder.sink import Recorder, folder_of
 
 HEARTBEAT = bytes.fromhex("fd09000001010100000000000000020c51040332a7")
@@ -193,13 +198,53 @@ def test_a_file_cut_anywhere_is_read_up_to_there(tmp_path):
 def test_a_recording_that_was_never_finished_loses_little(tmp_path):
     recorder, _, _ = bench(tmp_path)
     recorder.start()
-    for n in range(100):
+    for n in range(100):  # ten times a second
         for message in told(1 + 12 * n):
-            recorder.take(message)
+            recorder.take(replace(message, time_ns=message.time_ns + n * 10**8))
     (path,) = tmp_path.glob("*.mcap")  # as it is when we are killed: nothing waits in a buffer of ours
     found = list(RecordingFile(path).messages(images=False))
     recorder.stop()
-    assert len(found) > 1200 - 12 * 8
+    assert len(found) > 1200 - 12 * 12
+
+
+def test_the_index_of_a_long_file_is_kept_packed(tmp_path):
+    # The library would keep an object of a kilobyte for each chunk until the file ends: a tenth of the process an hour.
+    file = GrowingFile(tmp_path / "long.mcap")
+    mcap = McapFile(file, RecorderConfig(), 0, {}, ChunkLimits(size_bytes=1))
+    count = 300
+    for n in range(count):
+        mcap.write(Message(Kind.STATUS, n * 10**6, n, {"state": "b"}))
+        mcap.write(Message(Kind.MAVLINK, n * 10**6, n, {"link": 1, "direction": "in"}, HEARTBEAT))
+    assert not [found for found in gc.get_objects() if isinstance(found, ChunkIndex)]
+    mcap.finish()
+    file.close()
+    with file.path.open("rb") as opened:
+        reader = make_reader(opened, validate_crcs=True)
+        summary = reader.get_summary()
+        assert len(summary.chunk_indexes) == summary.statistics.chunk_count >= 2 * count
+        times_ns = [
+            message.log_time for *_, message in reader.iter_messages(topics=["/status", "/mavlink/1/in"])
+        ]
+    assert times_ns == sorted(n * 10**6 for n in range(count) for _ in range(2))
+
+
+def test_a_file_of_the_default_size_has_few_chunks(tmp_path):
+    recorder, _, _ = bench(tmp_path, frames="jpeg", tlog=False)
+    recorder.start()
+    rng = np.random.default_rng(5)
+    image = rng.integers(0, 255, (240, 320), np.uint8)
+    image.flags.writeable = False
+    for n in range(100):  # ten seconds
+        at_ns = n * 10**8
+        size = {"number": n, "seq": n, "time_of": "exposure", "height_px": 240, "width_px": 320}
+        recorder.take(Message(Kind.FRAME, at_ns, 2 * n, {**size, "taken_ns": at_ns}, b"", image))
+        recorder.take(Message(Kind.STATUS, at_ns, 2 * n + 1, {"state": "b"}))
+    recorder.stop()
+    (path,) = tmp_path.glob("*.mcap")
+    with path.open("rb") as opened:
+        chunks = len(make_reader(opened).get_summary().chunk_indexes)
+    most = path.stat().st_size / (64 * 1024) + 10 + 1  # by size, and one a second
+    assert 10 <= chunks <= most
 
 
 @pytest.mark.parametrize("content", [b"", b"nonsense" * 100])
@@ -322,7 +367,7 @@ def test_a_disk_that_becomes_full_ends_the_recording(tmp_path):
     os.close(full)
     for n in range(40):
         for message in told(100 + 12 * n):
-            recorder.take(message)
+            recorder.take(replace(message, time_ns=message.time_ns + n * 10**8))
         clock.now_s += 0.1
     assert not recorder.is_recording
     assert desk.announced() == ["recording stopped, No space left on device"]

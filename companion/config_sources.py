@@ -5,12 +5,13 @@ The order, later wins:
 1. the defaults (``companion.config``)
 2. the main file, ``config.toml``
 3. the files ``*.toml`` of the folder beside it that has its name, ``config.d/``, by name
-4. what a ground station has set (``ground_station.parameters_file``)
-5. the environment, ``VOID_COMPANION_GUIDANCE__MAX_STEP_M=1.0``
-6. the command line, ``-o guidance.max_step_m=1.0``
+4. what the live page has saved, where it does not save to the main file itself (``web.saved_file``)
+5. what a ground station has set (``ground_station.parameters_file``)
+6. the environment, ``VOID_COMPANION_GUIDANCE__MAX_STEP_M=1.0``
+7. the command line, ``-o guidance.max_step_m=1.0``
 
-A ground station's settings come after the files, or they would be lost with a restart; before the environment and the
-command line, which are meant for this run.
+Settings of page and ground station come after the files, or they would be lost with a restart; before the environment and the
+command line, which are meant for this run. A ground station is not told what is read later than its own and wins, the page is.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ _PATH_KEYS: Final = (
     "link.signing_key_file",
     "status.socket",
     "web.recordings",
+    "web.saved_file",
     "web.settings_file",
     "web.token_file",
 )
@@ -169,13 +171,13 @@ def load(places: ConfigPlaces, *, unsaved: Mapping[str, Any] | None = None) -> L
     """
     files = _file_layers(places)
     last = [*_environment_layers(places.environment), *_option_layers(places.options)]
-    tuned = _tuned_file(places, (*files, *last))
-    station: list[Layer] = []
-    if tuned is not None and tuned.exists():
-        station.append(Layer(str(tuned), _folder_of(places), parse_table(read_text(tuned), name=str(tuned))))
+    saved = _saved_file(places, (*files, *last))
+    page = _overlay_layers(places, saved)
+    tuned = _tuned_file(places, (*files, *page, *last))
+    station = _overlay_layers(places, tuned)
     for key, value in (unsaved or {}).items():
         station.append(Layer("ground station, not written yet", _folder_of(places), _table_of(key, value)))
-    layers = (*files, *station, *last)
+    layers = (*files, *page, *station, *last)
     table: dict[str, Any] = {}
     for layer in layers:
         table = merged(table, layer.table)
@@ -187,17 +189,13 @@ def load(places: ConfigPlaces, *, unsaved: Mapping[str, Any] | None = None) -> L
         return layers[0].name if layers else "configuration"
 
     config = config_of(table, name=place_of)
-    resolved = _resolved(config, layers, tuned)
-    if resolved.web.enabled and places.file is not None and not resolved.web.settings_file:
-        web = resolved.web.model_copy(update={"settings_file": str(places.file.absolute())})
-        resolved = resolved.model_copy(update={"web": web})
-    return LoadedConfig(resolved, layers)
+    return LoadedConfig(_with_page_files(_resolved(config, layers, tuned), places, saved), layers)
 
 
 def shown_with_origins(loaded: LoadedConfig) -> str:
     """Return a configuration as TOML, each value with where it comes from."""
     parts = [
-        "# Each value with where it comes from; later wins: file, drop-ins by name, ground station, environment, -o.\n"
+        "# Each value with where it comes from; later wins: file, drop-ins by name, live page, ground station, environment, -o.\n"
     ]
     for section, schema in section_schemas().items():
         table = getattr(loaded.config, section)
@@ -286,18 +284,54 @@ def _table_of(dotted: str, value: Any) -> dict[str, Any]:
     return {section: {key: value}}
 
 
+def _overlay_layers(places: ConfigPlaces, path: Path | None) -> list[Layer]:
+    """Return what a file holds that the service itself writes; nothing where there is none yet."""
+    if path is None or not path.exists():
+        return []
+    return [Layer(str(path), _folder_of(places), parse_table(read_text(path), name=str(path)))]
+
+
+def _state_folder() -> Path | None:
+    """Return where a unit of systemd may write, which is not beside its configuration (systemd.exec, StateDirectory=)."""
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    return Path(state) if state else None
+
+
+def _named(layers: Sequence[Layer], section: str, key: str) -> Path | None:
+    """Return the file that a key names, relative to who names it; what is not text is refused with the rest."""
+    setter = _setter(layers, f"{section}.{key}")
+    if setter is None or not isinstance(setter.table[section], Mapping):
+        return None
+    named = setter.table[section][key]
+    return setter.folder / named if isinstance(named, str) and named else None
+
+
+def _saved_file(places: ConfigPlaces, layers: Sequence[Layer]) -> Path | None:
+    """Return where the live page saves to in place of the main file; None: to that file."""
+    named, state = _named(layers, "web", "saved_file"), _state_folder()
+    if named is not None or places.file is None or state is None:
+        return named
+    return state / f"{places.file.stem}.page.toml"
+
+
+def _with_page_files(config: Config, places: ConfigPlaces, saved: Path | None) -> Config:
+    """Return a configuration that says which files the live page compares with and saves to."""
+    if places.file is None:
+        return config
+    updates: dict[str, str] = {}
+    if saved is not None and not config.web.settings_file:  # one that is named is saved to itself
+        updates["saved_file"] = str(saved)
+    if config.web.enabled and not config.web.settings_file:
+        updates["settings_file"] = str(places.file.absolute())
+    return config.model_copy(update={"web": config.web.model_copy(update=updates)}) if updates else config
+
+
 def _tuned_file(places: ConfigPlaces, layers: Sequence[Layer]) -> Path | None:
     """Return where a ground station's settings are kept: where it is named, else where the service may write."""
-    setter = _setter(layers, "ground_station.parameters_file")
-    if setter is not None and isinstance(setter.table["ground_station"], Mapping):
-        named = setter.table["ground_station"]["parameters_file"]
-        if isinstance(named, str) and named:  # what is not text is refused with the rest
-            return setter.folder / named
-    if places.file is None:
-        return None
-    # A unit of systemd may write there and not beside its configuration (systemd.exec, StateDirectory=).
-    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-    return (Path(state) if state else _folder_of(places)) / f"{places.file.stem}.tuned.toml"
+    named = _named(layers, "ground_station", "parameters_file")
+    if named is not None or places.file is None:
+        return named
+    return (_state_folder() or _folder_of(places)) / f"{places.file.stem}.tuned.toml"
 
 
 def _resolved(config: Config, layers: Sequence[Layer], tuned: Path | None) -> Config:

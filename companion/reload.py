@@ -81,7 +81,7 @@ class Reload:
         self._wanted = asyncio.Event()
         self._turn = asyncio.Lock()
         self._parameters = _digest(config.detector.params_file)
-        self._seen = signature_of(places, config.detector.params_file)
+        self._seen = signature_of(places, config.detector.params_file, config.web.saved_file)
 
     def request(self) -> None:
         """Ask for the configuration to be read again; :meth:`run` does it."""
@@ -147,7 +147,10 @@ class Reload:
             before = now
 
     async def _look(self) -> Signature:
-        return await asyncio.to_thread(signature_of, self._places, self._settings.active.detector.params_file)
+        active = self._settings.active
+        return await asyncio.to_thread(
+            signature_of, self._places, active.detector.params_file, active.web.saved_file
+        )
 
     async def _reload(self) -> None:
         """Take what may change; whatever is wrong with the rest, flying goes on with the old settings."""
@@ -216,9 +219,9 @@ def _with_values(config: Config, values: Mapping[str, Any]) -> Config:
     return config_of(table, name="settings that were asked for")
 
 
-def signature_of(places: ConfigPlaces, params_file: str) -> Signature:
-    """Return what tells whether a file of the configuration has changed; what is not there is left out."""
-    paths = [Path(params_file)] if params_file else []
+def signature_of(places: ConfigPlaces, *others: str) -> Signature:
+    """Return what tells whether a file of the configuration, or another that it names, has changed; what is not there is left out."""
+    paths = [Path(other) for other in others if other]
     if places.file is not None:
         paths.append(places.file)
     try:

@@ -69,6 +69,12 @@ class WebConfig(Section):
             description="Configuration file that the page compares with and saves to; empty: the one that the service was started with."
         ),
     ] = ""
+    saved_file: Annotated[
+        str,
+        Field(
+            description="File that the page saves to in place of settings_file, with nothing in it but what was saved; it is read after the drop-in files and wins over them. Empty: config.page.toml for config.toml in the state directory that systemd gives the service (STATE_DIRECTORY), unless settings_file is set; without one, settings_file itself is saved to."
+        ),
+    ] = ""
 
     def _disagreements(self) -> tuple[Disagreement, ...]:
         if is_loopback(self.host) or self.token_file:

@@ -75,7 +75,7 @@ async def _serve(config: Config, root: Path, port: int, file: Path | None) -> No
     from companion.web.studio import Studio
 
     web = config.web
-    settings = SettingsDesk(config, SettingsFile(file))
+    settings = SettingsDesk(config, SettingsFile.of(config, file))
     studio = Studio(root, lambda: settings.active, lambda: "")
     parts = Parts(Gate(web.host, read_token(web.token_file)), None, settings, studio)
     server = PageServer(make_application(parts), max_clients=web.max_clients)

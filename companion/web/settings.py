@@ -73,6 +73,7 @@ class SettingsDesk:
         return {
             "sections": sections,
             "file": None if self._file.path is None else str(self._file.path),
+            "saves_to": None if self._file.target is None else str(self._file.target),
             "revision": "" if disk is None else disk.revision,
             "fault": fault,
             "live": self._apply is not None,
@@ -108,11 +109,12 @@ class SettingsDesk:
         return answer
 
     async def save(self, values: Mapping[str, Any], *, revision: str, only_look: bool) -> dict[str, Any]:
-        """Write values into the file.
+        """Write values into the file that is saved to.
 
         Returns
         -------
-        ``accepted``; ``reasons`` why not; ``diff``; ``overruled``: by key the place that is read later and wins.
+        ``accepted``; ``reasons`` why not; ``diff``; ``file``, which was written; ``overruled``: by key the place that is read
+        later and wins.
         """
         kept_out = {key: KEPT_OUT_REASON for key in values if is_kept_out(key)}
         if kept_out:
@@ -125,13 +127,13 @@ class SettingsDesk:
                 disk = await asyncio.to_thread(self._file.read)
             except ConfigError as error:
                 return _refusal(*str(error).splitlines())
-        own = str(self._file.path)
+        own = str(self._file.target)
         overruled = {
             key: disk.origins[key]
             for key in values
             if disk.origins.get(key, own) not in (own, "") and not only_look
         }
-        return {"accepted": True, "reasons": [], "diff": diff, "overruled": overruled}
+        return {"accepted": True, "reasons": [], "diff": diff, "file": own, "overruled": overruled}
 
     async def _ask(self, values: Mapping[str, Any]) -> dict[str, Any]:
         if self._apply is None:

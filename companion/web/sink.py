@@ -118,7 +118,9 @@ class LivePage:
                 self._state, self._lock, max_clients=web.max_clients, on_change=self._tell_wants
             )
             path = Path(web.settings_file) if web.settings_file else None
-            self._settings = settings = SettingsDesk(self._config, SettingsFile(path), self._apply)
+            self._settings = settings = SettingsDesk(
+                self._config, SettingsFile.of(self._config, path), self._apply
+            )
             studio = Studio(_recordings(self._config), lambda: settings.active, self._why_not_compare)
             parts = Parts(self._gate, viewers, settings, studio)
             self._server = PageServer(make_application(parts), max_clients=web.max_clients)

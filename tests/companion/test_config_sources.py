@@ -11,6 +11,7 @@ from companion.config import Config
 from companion.config_file import parse_config
 from companion.config_sources import ConfigPlaces, load, shown_with_origins
 from companion.errors import ConfigError
+from companion.reload import signature_of
 
 KEY = "guidance.max_step_m"
 
@@ -53,6 +54,47 @@ def test_the_later_place_wins_and_is_named(tmp_path, levels, value, origin):
     assert loaded.config.guidance.agree_deg == 15.0
     assert loaded.origin("guidance.agree_deg").endswith("config.toml")
     assert loaded.origin("guidance.align_deg") == "default"
+
+
+def test_what_the_page_saved_under_systemd_is_read_between_the_files_and_the_ground_station(
+    tmp_path, monkeypatch, capsys
+):
+    state = tmp_path / "state"
+    write(state / "config.page.toml", "[guidance]\nmax_step_m = 3.5\nagree_deg = 16.0\n")
+    three = places(tmp_path, levels=3)
+    assert (
+        load(three).config.guidance.max_step_m == 3.0
+    )  # without a state directory the main file is saved to
+    assert load(three).config.web.saved_file == ""
+    monkeypatch.setenv("STATE_DIRECTORY", str(state))
+    loaded = load(three)
+    page = str(state / "config.page.toml")
+    assert (loaded.config.guidance.max_step_m, loaded.origin(KEY)) == (3.5, page)
+    assert loaded.config.web.saved_file == page
+    assert main(["config", "--show", "-c", str(three.file)]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("agree_deg = ")]
+    assert line.endswith(f"# {page}")
+    write(state / "config.tuned.toml", "[guidance]\nmax_step_m = 4.0\n")
+    assert load(three).config.guidance.max_step_m == 4.0
+    assert load(places(tmp_path, levels=5)).config.guidance.max_step_m == 5.0
+    write(state / "config.page.toml", "[guidance]\nmax_step_m = -1.0\nagree_deg = true\n")
+    with pytest.raises(ConfigError, match=r"config\.page\.toml: guidance\.agree_deg"):
+        load(three)
+
+
+def test_a_page_file_that_is_named_is_read_and_saved_to(tmp_path):
+    main_file = tmp_path / "config.toml"
+    write(main_file, '[guidance]\nmax_step_m = 1.0\n[web]\nsaved_file = "saved/mine.toml"\n')
+    assert load(ConfigPlaces(main_file)).config.web.saved_file == str(tmp_path / "saved" / "mine.toml")
+    write(tmp_path / "saved" / "mine.toml", "[guidance]\nmax_step_m = 2.5\n")
+    assert load(ConfigPlaces(main_file)).config.guidance.max_step_m == 2.5
+
+
+def test_a_file_that_the_page_has_saved_is_noticed(tmp_path):
+    one, saved = places(tmp_path, levels=1), tmp_path / "page.toml"
+    before = signature_of(one, "", str(saved))
+    write(saved, "[guidance]\nmax_step_m = 2.5\n")
+    assert signature_of(one, "", str(saved)) != before
 
 
 def test_a_setting_that_is_not_in_its_file_yet_counts_as_if_it_were(tmp_path):

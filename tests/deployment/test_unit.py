@@ -112,3 +112,15 @@ def test_the_installer_refuses_wrong_words_in_one_line_before_it_does_anything(w
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
     assert done.stdout == ""
+
+
+def test_what_the_page_saves_and_a_ground_station_sets_goes_with_the_state_folder():
+    (start,) = settings()["ExecStart"]
+    (folder,) = settings()["StateDirectory"]
+    installer = INSTALLER.read_text()
+    assert f"/var/lib/{folder}" in settings()["WorkingDirectory"]
+    (removal,) = re.findall(
+        r"(?m)^    rm -rf .*$", installer.partition("remove_everything() {")[2].partition("\n}\n")[0]
+    )
+    assert "/var/lib/$name" in removal.split()
+    assert "-c /etc/void-companion/config.toml" in start  # config.page.toml is named after it

@@ -176,7 +176,7 @@ export class SettingsView {
   compare() {
     const staged = this.staged;
     const keys = [...this.entries.values()].filter((entry) => staged.has(entry.key) || (entry.file !== undefined && !same(entry.value, entry.file)));
-    setText(byId("compare-file"), this.form.file ? `File: ${this.form.file}` : "The service was started without a configuration file: there is none to save to.");
+    setText(byId("compare-file"), this.form.file ? (this.form.saves_to === this.form.file ? `File: ${this.form.file}` : `File: ${this.form.file}. It stays as it is: saved to ${this.form.saves_to}, which is read after it and wins.`) : "The service was started without a configuration file: there is none to save to.");
     byId("compare-rows").replaceChildren(
       ...keys.map((entry) => {
         const value = staged.has(entry.key) ? staged.get(entry.key) : entry.value;
@@ -216,7 +216,7 @@ export class SettingsView {
       return;
     }
     const overruled = Object.entries(answer.overruled || {}).map(([key, place]) => `${key} is also set in ${place}, which wins`);
-    setText(message, ["Saved; comments are as they were.", ...overruled].join(" "));
+    setText(message, [`Saved to ${answer.file}; comments are as they were.`, ...overruled].join(" "));
     for (const key of Object.keys(values)) this.staged.delete(key);
     await this.load();
   }

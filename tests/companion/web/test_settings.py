@@ -44,6 +44,10 @@ def content(path: Path) -> str:
     return path.read_text()
 
 
+def is_there(path: Path) -> bool:
+    return path.exists()
+
+
 def put(path: Path, text: str) -> None:
     path.write_text(text)
 
@@ -165,6 +169,87 @@ async def test_what_would_break_the_file_is_not_saved(desk: SettingsDesk, path: 
     kept_out = await desk.save({"web.host": "0.0.0.0"}, revision=revision, only_look=False)  # noqa: S104
     assert "decides who may reach" in kept_out["reasons"][0]
     assert content(path) == SETTINGS_TOML
+
+
+@pytest.fixture
+def under_systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give the service a state directory; return what the page then saves to."""
+    state = tmp_path / "state"
+    state.mkdir()
+    monkeypatch.setenv("STATE_DIRECTORY", str(state))
+    return state / "config.page.toml"
+
+
+@pytest.fixture
+def saving_desk(under_systemd: Path, path: Path) -> SettingsDesk:
+    config = load_config(path)
+    assert config.web.saved_file == str(under_systemd)
+    return SettingsDesk(config, SettingsFile.of(config, path))
+
+
+async def test_under_systemd_it_is_saved_where_the_service_may_write_and_read_after_the_files(
+    saving_desk: SettingsDesk, under_systemd: Path, path: Path
+) -> None:
+    (path.parent / "config.d").mkdir()
+    put(path.parent / "config.d" / "10-hall.toml", "[guidance]\nmax_step_m = 0.5\n")
+    form = await saving_desk.form()
+    assert (form["file"], form["saves_to"]) == (str(path), str(under_systemd))
+    values = {"guidance.max_step_m": 0.7, "detector.method": "paper"}
+    looked = await saving_desk.save(values, revision=form["revision"], only_look=True)
+    assert "+max_step_m = 0.7" in looked["diff"]
+    assert not is_there(under_systemd)
+    saved = await saving_desk.save(values, revision=form["revision"], only_look=False)
+    assert saved["accepted"]
+    assert (saved["file"], saved["overruled"]) == (str(under_systemd), {})
+    assert content(path) == SETTINGS_TOML
+    assert tomllib.loads(content(under_systemd)) == {
+        "guidance": {"max_step_m": 0.7},
+        "detector": {"method": "paper"},
+    }
+    config = load_config(path)
+    assert (config.guidance.max_step_m, config.detector.method) == (0.7, "paper")
+
+    again = await saving_desk.save({"guidance.agree_deg": 9.0}, revision=form["revision"], only_look=False)
+    assert "config.page.toml has changed meanwhile" in again["reasons"][0]
+    put(under_systemd, content(under_systemd).replace("0.7", "0.7  # the hall"))
+    form = await saving_desk.form()
+    assert entry_of(form, "guidance.max_step_m")["file"] == 0.7
+    saved = await saving_desk.save({"guidance.agree_deg": 9.0}, revision=form["revision"], only_look=False)
+    assert saved["accepted"]
+    assert "max_step_m = 0.7  # the hall\nagree_deg = 9.0" in content(under_systemd)
+
+
+async def test_what_does_not_go_with_the_files_is_not_saved_beside_them(
+    saving_desk: SettingsDesk, under_systemd: Path
+) -> None:
+    revision = (await saving_desk.form())["revision"]
+    for values in ({"guidance.max_step_m": -1.0}, {"guidance.view_deg": 80.0}, {"nothing.at_all": True}):
+        answer = await saving_desk.save(values, revision=revision, only_look=False)
+        assert not answer["accepted"]
+        assert answer["reasons"]
+    assert not is_there(under_systemd)
+
+
+async def test_what_a_ground_station_has_set_wins_over_what_the_page_saved_and_it_says_so(
+    saving_desk: SettingsDesk, under_systemd: Path
+) -> None:
+    station = under_systemd.with_name("config.tuned.toml")
+    put(station, "[guidance]\nmax_step_m = 0.3\n")
+    revision = (await saving_desk.form())["revision"]
+    saved = await saving_desk.save({"guidance.max_step_m": 0.7}, revision=revision, only_look=False)
+    assert saved["overruled"] == {"guidance.max_step_m": str(station)}
+
+
+async def test_a_file_that_is_named_is_saved_to_itself(under_systemd: Path, path: Path) -> None:
+    put(path, f'{SETTINGS_TOML}\n[web]\nsettings_file = "{path.name}"\n')
+    config = load_config(path)
+    assert config.web.saved_file == ""
+    desk = SettingsDesk(config, SettingsFile.of(config, Path(config.web.settings_file)))
+    revision = (await desk.form())["revision"]
+    saved = await desk.save({"guidance.max_step_m": 0.7}, revision=revision, only_look=False)
+    assert saved["file"] == str(path)
+    assert "= 0.7  # careful indoors" in content(path)
+    assert not is_there(under_systemd)
 
 
 async def test_a_file_that_cannot_be_used_is_said_and_the_form_still_shows_what_acts(

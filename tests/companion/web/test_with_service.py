@@ -33,7 +33,10 @@ async def ask(port: int, method: str, path: str, body: Any = None) -> Any:
 
 
 @pytest.mark.timeout(240)
-async def test_the_service_is_seen_and_tuned_and_does_not_need_the_page(tmp_path: Path) -> None:
+async def test_the_service_is_seen_and_tuned_and_does_not_need_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))  # as systemd does
     port = free_port()
     tables = {
         "web": {"enabled": True, "port": port, "recordings": str(OFFICE_WALK.parent)},
@@ -71,6 +74,15 @@ async def test_the_service_is_seen_and_tuned_and_does_not_need_the_page(tmp_path
             "office_walk"
         ]
         assert (await ask(port, "POST", "/api/settings/undo", {}))["accepted"]
+
+        saving = {"values": {"guidance.align_deg": 14.0}, "revision": form["revision"], "only_look": False}
+        saved = await ask(port, "POST", "/api/settings/save", saving)
+        assert saved["accepted"], saved
+        assert saved["file"] == form["saves_to"] == str(tmp_path / "companion.page.toml")
+        reloaded = await service.wait_for(  # it is noticed as any file of the configuration
+            "config_reloaded", PATIENCE_S, where=lambda event: "guidance.align_deg" in event["changed"]
+        )
+        assert reloaded["changed"]["guidance.align_deg"] == 14.0
 
         started = await service.wait_for("io_started", PATIENCE_S)
         os.kill(started["pid"], signal.SIGKILL)  # the page dies, the service flies on and starts it again

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from detector.drawing.frame import FrameCanvas
 from detector.drawing.palette import BLUE, GREEN, ORANGE, RED, SKY, WHITE, YELLOW
 from detector.pipeline import PairResult
 from detector.results import Detection, Diagnostics, Direction, DirectionKind, NoDetection, SinglePlane
+
+if TYPE_CHECKING:
+    from detector.evaluation.methods import Answer
 
 _LENGTH_QUANTILE: Final = 95.0
 """Flow of this percentile and more has the last colour: a few wild vectors do not take the scale from the rest."""
@@ -90,6 +93,35 @@ def draw(
     # The text goes where the direction is not.
     at_the_bottom = isinstance(detection, Direction) and detection.y_px < 0.25 * image.shape[0]
     canvas.band([headline(detection), *_figures(diagnostics), *notes], at_the_bottom=at_the_bottom)
+    return canvas.picture
+
+
+def draw_answer(
+    image: NDArray[np.uint8], answer: Answer, *, zoom: int = 1, notes: Sequence[str] = ()
+) -> NDArray[np.uint8]:
+    """Return a colour picture of an answer of which nothing else is known, as of a rival: its mark as in :func:`draw`, or its reason in words.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey or (H, W, 3) BGR uint8, the second frame; it is not changed.
+    answer
+        What was said of it.
+    zoom, notes
+        As :func:`draw` takes them.
+
+    Returns
+    -------
+    (zoom * H, zoom * W, 3) uint8, BGR.
+    """
+    canvas = FrameCanvas(image, zoom)
+    if answer.point_px is None:
+        words = f"no detection: {answer.reason}"
+    else:
+        canvas.cross(answer.point_px)
+        words = f"{answer.kind.replace('_', ' ')} at ({answer.point_px[0]:.0f}, {answer.point_px[1]:.0f})"
+    at_the_bottom = answer.point_px is not None and answer.point_px[1] < 0.25 * image.shape[0]
+    canvas.band([words, *notes], at_the_bottom=at_the_bottom)
     return canvas.picture
 
 

@@ -37,7 +37,7 @@ def by_parallax(camera: CameraModel | None) -> FrameAnswerer:
             def paint(picture: NDArray[np.uint8], notes: tuple[str, ...]) -> NDArray[np.uint8]:
                 return draw_reading(picture, seen, camera, pose.world_from_camera, notes=notes)
 
-        return Answered(seen, no_tracks(), paint)
+        return Answered.of(seen, no_tracks(), paint)
 
     return answer
 

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from detector.camera_model import CameraModel
+from detector.drawing import sheet
+from detector.evaluation.methods import Answer, answer_of
 from detector.flow import Tracks
 from detector.frame import Frame
 from detector.observer import CameraPose, Observation, VoidObserver
-from detector.overlay import draw, legible_zoom
+from detector.overlay import draw, draw_answer, legible_zoom
 from detector.params import DetectorParams
 from detector.pipeline import PairResult, VoidDetector
-from detector.results import Diagnostics, NoDetection, NoDetectionReason
+from detector.results import Detection, Diagnostics, NoDetection, NoDetectionReason
 
+PANELS_A_ROW: Final = 3
 _DIGITS: Final = re.compile(r"(\d+)")
 
 
@@ -30,22 +33,50 @@ class Answered:
 
     Attributes
     ----------
-    observation
-        The answer, its times and its baseline.
+    answer
+        What the method says, in the words that all methods have.
+    detection
+        The same with all that the detector found on the way; None of a rival, which finds nothing else.
+    time_ns, earlier_time_ns
+        Of this frame and of its partner; None where there was none.
+    baseline_m
+        Metres flown between the two, where both poses are known.
     tracks
         The N' vectors behind it; empty where no pair was looked at.
     paint
-        Draws the answer on the frame, with lines of text; None: as :func:`detector.overlay.draw` does.
+        Draws the answer on the frame, with lines of text; None: as :mod:`detector.overlay` does.
     """
 
-    observation: Observation
+    answer: Answer
+    detection: Detection | None
+    time_ns: int
+    earlier_time_ns: int | None
+    baseline_m: float | None
     tracks: Tracks
     paint: Callable[[NDArray[np.uint8], tuple[str, ...]], NDArray[np.uint8]] | None = None
 
+    @classmethod
+    def of(
+        cls,
+        observation: Observation,
+        tracks: Tracks,
+        paint: Callable[[NDArray[np.uint8], tuple[str, ...]], NDArray[np.uint8]] | None = None,
+    ) -> Self:
+        """Return an observation's answer."""
+        return cls(
+            answer_of(observation.detection),
+            observation.detection,
+            observation.time_ns,
+            observation.earlier_time_ns,
+            observation.baseline_m,
+            tracks,
+            paint,
+        )
+
     @property
-    def result(self) -> PairResult:
-        """The answer with its tracks, for drawing."""
-        return PairResult(self.observation.detection, self.tracks, None)
+    def result(self) -> PairResult | None:
+        """The detection with its tracks, for drawing; None of a rival."""
+        return None if self.detection is None else PairResult(self.detection, self.tracks, None)
 
 
 FrameAnswerer = Callable[[NDArray[np.uint8], int, CameraPose | None], Answered]
@@ -60,7 +91,7 @@ def by_observer(params: DetectorParams, camera: CameraModel | None) -> FrameAnsw
     def answer(image: NDArray[np.uint8], time_ns: int, pose: CameraPose | None) -> Answered:
         recorder.tracks = no_tracks()
         observation = observer.observe(image, time_ns, pose)
-        return Answered(observation, recorder.tracks)
+        return Answered.of(observation, recorder.tracks)
 
     return answer
 
@@ -92,7 +123,7 @@ def by_fixed_step(params: DetectorParams, camera: CameraModel | None, step: int)
         if earlier is None:
             words = f"frame {len(kept)} of the first {step}"
             nothing = NoDetection(NoDetectionReason.NO_EARLIER_FRAME, words, Diagnostics())
-            return Answered(Observation(nothing, time_ns), no_tracks())
+            return Answered.of(Observation(nothing, time_ns), no_tracks())
         frame, earlier_ns, earlier_pose = earlier
         rotation = translation = baseline_m = None
         if pose is not None and earlier_pose is not None:
@@ -104,7 +135,7 @@ def by_fixed_step(params: DetectorParams, camera: CameraModel | None, step: int)
         result = detector.detect(
             frame, later, camera=camera, later_from_earlier=rotation, translation_earlier=translation
         )
-        return Answered(Observation(result.detection, time_ns, earlier_ns, baseline_m), result.tracks)
+        return Answered.of(Observation(result.detection, time_ns, earlier_ns, baseline_m), result.tracks)
 
     return answer
 
@@ -160,16 +191,48 @@ def annotated(image: NDArray[np.uint8], answered: Answered, number: int, time_s:
     -------
     (H', W', 3) uint8, BGR, both sides even: video codecs need it.
     """
-    observation = answered.observation
     words = f"frame {number}  {time_s:.2f} s"
-    if observation.earlier_time_ns is not None:
-        words += f"  pair over {(observation.time_ns - observation.earlier_time_ns) * 1e-9:.2f} s"
-    if observation.baseline_m is not None:
-        words += f", {observation.baseline_m:.2f} m"
+    if answered.earlier_time_ns is not None:
+        words += f"  pair over {(answered.time_ns - answered.earlier_time_ns) * 1e-9:.2f} s"
+    if answered.baseline_m is not None:
+        words += f", {answered.baseline_m:.2f} m"
+    zoom, result = legible_zoom(image.shape[1]), answered.result
     if answered.paint is not None:
         picture = answered.paint(image, (words,))
+    elif result is not None:
+        picture = draw(image, result, zoom=zoom, notes=(words,))
     else:
-        picture = draw(image, answered.result, zoom=legible_zoom(image.shape[1]), notes=(words,))
+        picture = draw_answer(image, answered.answer, zoom=zoom, notes=(words,))
+    return _even(picture)
+
+
+def side_by_side(
+    image: NDArray[np.uint8], answered: Mapping[str, Answered], number: int, time_s: float
+) -> NDArray[np.uint8]:
+    """Return a frame with the answers of several methods, each in a panel with the method's name below it.
+
+    Parameters
+    ----------
+    image
+        (H, W) uint8.
+    answered
+        By method, in their order; :data:`PANELS_A_ROW` in a row. One alone has the whole picture, without its name.
+    number, time_s
+        As for :func:`annotated`, whose panels these are.
+
+    Returns
+    -------
+    (H', W', 3) uint8, BGR, both sides even.
+    """
+    panels = {name: annotated(image, each, number, time_s) for name, each in answered.items()}
+    if len(panels) == 1:
+        return next(iter(panels.values()))
+    labelled = [sheet.captioned(picture, name) for name, picture in panels.items()]
+    rows = [labelled[first : first + PANELS_A_ROW] for first in range(0, len(labelled), PANELS_A_ROW)]
+    return _even(sheet.one_below_the_other([sheet.side_by_side(row) for row in rows]))
+
+
+def _even(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 

@@ -15,8 +15,26 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from detector.evaluation.methods import Answer
     from detector.pipeline import PairResult
 
+ANSWER_KEYS: Final = (
+    "kind",
+    "x_px",
+    "y_px",
+    "reason",
+    "detail",
+    "time_to_contact_frames",
+    "time_to_contact_spread_frames",
+    "time_to_contact_samples",
+    "time_to_contact_s",
+    "time_to_contact_spread_s",
+    "distance_m",
+    "distance_spread_m",
+    "confidence",
+    "diagnostics",
+)
+"""Of :func:`as_dict`."""
 _DESCRIPTION: Final = """\
 Find the void (the way that is furthest from obstacles), or a single plane, in two frames of one camera that moved.
 """
@@ -122,6 +140,14 @@ def as_dict(
         "diagnostics": dataclasses.asdict(detection.diagnostics),
     }
     cleaned: dict[str, Any] = inputs.json_clean(answer)
+    return cleaned
+
+
+def rival_as_dict(answer: Answer) -> dict[str, Any]:
+    """Return a rival's answer (:mod:`detector.evaluation.methods`) with the same keys; null what a rival does not say."""
+    x_px, y_px = answer.point_px or (None, None)
+    said = {"kind": answer.kind, "x_px": x_px, "y_px": y_px, "reason": answer.reason}
+    cleaned: dict[str, Any] = inputs.json_clean({**dict.fromkeys(ANSWER_KEYS), **said})
     return cleaned
 
 

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -86,6 +87,25 @@ def params_of(options: argparse.Namespace) -> DetectorParams:
         return DetectorParams.from_toml(options.params, options.preset)
     except ParamsError as error:
         raise InputError(one_line(error)) from error
+
+
+def methods_of(option: str, texts: Sequence[str]) -> tuple[str, ...]:
+    """Return the methods that an option names, in their order: each text one name, or several with commas between.
+
+    Raises
+    ------
+    InputError
+        One is not known, or named twice.
+    """
+    from detector.evaluation.methods import METHODS
+
+    names = tuple(name.strip() for text in texts for name in text.split(","))
+    for name in names:
+        if name not in METHODS:
+            raise InputError(f"{option}: found {short(name)}, allowed are {', '.join(METHODS)}")
+        if names.count(name) > 1:
+            raise InputError(f"{option}: found {name} {names.count(name)} times, allowed is once")
+    return names
 
 
 def camera_of(options: argparse.Namespace, width_px: int, height_px: int) -> CameraModel | None:

@@ -6,27 +6,25 @@ import argparse
 import contextlib
 import json
 import math
-import signal
 import sys
-import threading
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from types import FrameType
 from typing import IO, TYPE_CHECKING, Any, Final
 
 from detector.commands import inputs
 from detector.commands.inputs import InputError
+from detector.commands.stopping import stop_request
 
 if TYPE_CHECKING:
     from detector.camera_model import CameraModel
     from detector.commands.clips import ClipFrame, ClipWriter, FolderClip, VideoClip
     from detector.observer import CameraPose
-    from detector.video import Answered
+    from detector.video import Answered, FrameAnswerer
 
 _DESCRIPTION: Final = """\
-Run the detector on a clip as a vehicle would, and write the clip with the answer drawn on every frame.
+Run one or more methods on a clip as a vehicle would, and write the clip with the answer drawn on every frame.
 """
 
 _EPILOG: Final = """\
@@ -34,8 +32,17 @@ SOURCE is a video file, or a folder of images, which are taken in natural order 
 their folder when that is called images, there may be a groundtruth.json or poses.json with K and poses: they are used, so
 that pairs are chosen by the distance flown and rotation is taken out. Without poses pairs are chosen by the median flow.
 
+--method NAME[,NAME...]
+  paper         flow clusters and lines
+  parallax      the void map, drawn too where poses are known
+  straight      rival: the middle of the picture
+  flow_balance  rival: away from the side where more moves
+  line_vp       rival: the vanishing point of the lines alone
+  Several make one film, with a panel for each and its name below; --method may also be repeated. All choose their pairs alike.
+
 JSON lines
-  One object a frame, with the keys of "detector detect --json" (see there) and
+  One object a frame and method, with the keys of "detector detect --json" (see there; null what a rival does not say) and
+  method      its name
   frame       number of the frame, from 0
   file        name of its file; null in a video
   time_s      since the first frame
@@ -47,9 +54,9 @@ exit code
   0    written
   2    the command line or a file that it names cannot be used; one line on stderr says which and why
   130  interrupted (Ctrl-C); what was written until then can be played
+  143  terminated (SIGTERM); the same
 """
 
-_EXIT_INTERRUPTED: Final = 130
 _MAX_FRAMES: Final = 100_000_000
 
 
@@ -74,9 +81,9 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument("--json-lines", type=Path, metavar="FILE", help="write one JSON object a frame")
     parser.add_argument(
         "--method",
-        choices=("paper", "parallax"),
-        default="paper",
-        help="paper: flow clusters and lines; parallax: the void map, drawn too where poses are known (default: %(default)s)",
+        action="append",
+        metavar="NAME[,NAME...]",
+        help="whose answers, see below; several are shown side by side (default: paper)",
     )
     inputs.add_params_arguments(parser)
     inputs.add_camera_arguments(parser)
@@ -84,7 +91,7 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--baseline-frames",
         type=_count,
         metavar="N",
-        help="pair each frame with the one N frames before it, in place of choosing by distance or flow",
+        help="pair each frame with the one N frames before it, in place of choosing by distance or flow; with the method paper alone",
     )
     parser.add_argument("--limit", type=_count, metavar="N", help="stop after N frames")
     parser.add_argument(
@@ -110,36 +117,45 @@ def _run(options: argparse.Namespace) -> int:
     from detector.commands.clips import ClipWriter, FolderClip, open_clip, poses_of
 
     inputs.params_of(options)  # before anything is written
-    if options.method == "parallax" and options.baseline_frames is not None:
-        raise InputError("--baseline-frames: not with --method parallax, which chooses its pairs by distance")
+    methods = inputs.methods_of("--method", options.method or ["paper"])
+    if methods != ("paper",) and options.baseline_frames is not None:
+        raise InputError("--baseline-frames: only with --method paper, the others choose their pairs")
     _refuse_overwriting(options.source, options.output)
     clip = open_clip(options.source, options.rate)
     camera: CameraModel | None = None
     poses: dict[str, CameraPose] = {}
     if isinstance(clip, FolderClip) and not options.no_poses:
         camera, poses = poses_of(clip)
-    kinds: Counter[str] = Counter()
-    interrupted = False
+    kinds: dict[str, Counter[str]] = {name: Counter() for name in methods}
     with (
+        stop_request() as stop,  # around the file, so that it is closed whatever comes
         ClipWriter(options.output, clip.rate_hz, options.codec) as writer,
         _lines(options.json_lines) as lines,
-        _after_this_frame() as asked_to_stop,
     ):
+        interrupted = False
         try:
-            with contextlib.closing(_answers(options, clip, camera, poses)) as answers:
+            with contextlib.closing(_answers(options, methods, clip, camera, poses)) as answers:
                 for number, frame, answered in answers:
-                    _write(writer, lines, number, frame, answered, kinds)
-                    if asked_to_stop():
+                    _write(writer, lines, number, frame, answered)
+                    for name, each in answered.items():
+                        kinds[name][each.answer.kind] += 1
+                    if stop.by is not None:
                         interrupted = True
                         break
         except KeyboardInterrupt:
             interrupted = True
+        finally:
+            stop.hurry = False
     if writer.written:
         writer.check()
     if interrupted:
         print(f"detector: interrupted: {options.output} holds {writer.written} frames", file=sys.stderr)
-        return _EXIT_INTERRUPTED
-    found = ", ".join(f"{kind} {count}" for kind, count in kinds.most_common())
+        return stop.exit_code
+    found = "; ".join(
+        ("" if len(kinds) == 1 else f"{name}: ")
+        + ", ".join(f"{kind} {count}" for kind, count in counts.most_common())
+        for name, counts in kinds.items()
+    )
     wanted = _wanted(options, clip)
     of = f" (the source states {wanted})" if wanted is not None and wanted > writer.written else ""
     print(f"{options.output}: {writer.written} frames{of}: {found}")
@@ -148,33 +164,41 @@ def _run(options: argparse.Namespace) -> int:
 
 def _answers(
     options: argparse.Namespace,
+    methods: Sequence[str],
     clip: FolderClip | VideoClip,
     known_camera: CameraModel | None,
     poses: dict[str, CameraPose],
-) -> Generator[tuple[int, ClipFrame, Answered]]:
-    """Answer on the frames one by one, with a progress bar on a terminal."""
-    from detector.video import FrameAnswerer, by_fixed_step, by_observer
-
-    params = inputs.params_of(options)
-    answer: FrameAnswerer | None = None
+) -> Generator[tuple[int, ClipFrame, dict[str, Answered]]]:
+    """Answer on the frames one by one, by each method, with a progress bar on a terminal."""
+    answerers: dict[str, FrameAnswerer] = {}
     with _progress(_wanted(options, clip)) as advance:
         for number, frame in enumerate(islice(clip.frames(), options.limit)):
-            if answer is None:
+            if not answerers:
                 height_px, width_px = frame.image.shape
                 camera = inputs.camera_of(options, width_px, height_px)
                 if options.hfov is None and options.camera is None:
                     camera = known_camera
-                if options.method == "parallax":
-                    from detector.parallax_video import by_parallax
-
-                    answer = by_parallax(camera)
-                elif options.baseline_frames is None:
-                    answer = by_observer(params, camera)
-                else:
-                    answer = by_fixed_step(params, camera, options.baseline_frames)
+                answerers = {name: _answerer(name, options, camera) for name in methods}
             pose = None if frame.name is None else poses.get(frame.name)
-            yield number, frame, answer(frame.image, round(frame.time_s * 1e9), pose)
+            time_ns = round(frame.time_s * 1e9)
+            yield number, frame, {name: each(frame.image, time_ns, pose) for name, each in answerers.items()}
             advance()
+
+
+def _answerer(method: str, options: argparse.Namespace, camera: CameraModel | None) -> FrameAnswerer:
+    from detector.evaluation.methods import METHODS
+    from detector.parallax_video import by_parallax
+    from detector.rival_video import by_rival
+    from detector.video import by_fixed_step, by_observer
+
+    params = inputs.params_of(options)
+    if method == "parallax":
+        return by_parallax(camera)
+    if method != "paper":
+        return by_rival(METHODS[method](params), params, camera)
+    if options.baseline_frames is not None:
+        return by_fixed_step(params, camera, options.baseline_frames)
+    return by_observer(params, camera)
 
 
 def _wanted(options: argparse.Namespace, clip: FolderClip | VideoClip) -> int | None:
@@ -190,65 +214,40 @@ def _write(
     lines: IO[str] | None,
     number: int,
     frame: ClipFrame,
-    answered: Answered,
-    kinds: Counter[str],
+    answered: dict[str, Answered],
 ) -> None:
-    from detector.commands.detect import kind_of
-    from detector.video import annotated
+    from detector.video import side_by_side
 
-    writer.write(annotated(frame.image, answered, number, frame.time_s))
-    kinds[kind_of(answered.observation.detection)] += 1
-    if lines is not None:
+    writer.write(side_by_side(frame.image, answered, number, frame.time_s))
+    if lines is None:
+        return
+    for name, each in answered.items():
         try:
-            lines.write(json.dumps(_record(number, frame, answered), allow_nan=False) + "\n")
+            lines.write(json.dumps(_record(number, frame, name, each), allow_nan=False) + "\n")
         except OSError as error:
             raise InputError(
                 f"--json-lines {lines.name}: cannot be written: {inputs.cause(error)}"
             ) from error
 
 
-def _record(number: int, frame: ClipFrame, answered: Answered) -> dict[str, Any]:
-    from detector.commands.detect import as_dict
+def _record(number: int, frame: ClipFrame, method: str, answered: Answered) -> dict[str, Any]:
+    from detector.commands.detect import as_dict, rival_as_dict
 
-    observation = answered.observation
-    earlier_ns = observation.earlier_time_ns
-    interval_s = None if earlier_ns is None else (observation.time_ns - earlier_ns) * 1e-9
+    earlier_ns, result = answered.earlier_time_ns, answered.result
+    interval_s = None if earlier_ns is None else (answered.time_ns - earlier_ns) * 1e-9
     return {
         "frame": number,
         "file": frame.name,
+        "method": method,
         "time_s": frame.time_s,
         "earlier_time_s": None if earlier_ns is None else earlier_ns * 1e-9,
-        "baseline_m": observation.baseline_m,
-        **as_dict(answered.result, observation.baseline_m, interval_s),
+        "baseline_m": answered.baseline_m,
+        **(
+            rival_as_dict(answered.answer)
+            if result is None
+            else as_dict(result, answered.baseline_m, interval_s)
+        ),
     }
-
-
-@contextlib.contextmanager
-def _after_this_frame() -> Iterator[Callable[[], bool]]:
-    """Let the first Ctrl-C wait for the end of a frame, so that picture, line and count agree; a second one does not wait.
-
-    Yields what tells whether there was one.
-    """
-    asked = False
-
-    def note(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-
-    # A handler can be set in the main thread alone, and a process that was told to ignore the signal goes on doing so.
-    is_ours = (
-        threading.current_thread() is threading.main_thread()
-        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    )
-    if is_ours:
-        signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: asked
-    finally:
-        if is_ours:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @contextlib.contextmanager

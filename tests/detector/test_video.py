@@ -10,12 +10,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detector.camera_model import CameraModel
+from detector.evaluation.methods import METHODS, Answer, PairInput
 from detector.flow import Tracks
 from detector.observer import CameraPose, Observation, VoidObserver
 from detector.params import DetectorParams
 from detector.pipeline import VoidDetector
 from detector.results import Diagnostics, NoDetection, NoDetectionReason, SinglePlane
-from detector.video import Answered, annotated, by_fixed_step, by_observer, fitted, natural_key
+from detector.rival_video import by_rival
+from detector.video import (
+    PANELS_A_ROW,
+    Answered,
+    annotated,
+    by_fixed_step,
+    by_observer,
+    fitted,
+    natural_key,
+    no_tracks,
+    side_by_side,
+)
 
 OFFICE = Path(__file__).parents[1] / "data" / "pairs" / "office"
 PARAMS = DetectorParams.preset("default")
@@ -49,10 +61,10 @@ def test_the_answers_are_the_observers_and_come_with_their_tracks(with_poses):
         given_pose = known if with_poses else None
         answered = answer(picture, time_ns, given_pose)
         expected = observer.observe(picture, time_ns, given_pose)
-        same_answer(answered.observation.detection, expected.detection)
-        assert answered.observation.earlier_time_ns == expected.earlier_time_ns
-        assert answered.observation.baseline_m == expected.baseline_m
-        assert len(answered.tracks) == answered.observation.detection.diagnostics.n_after_distribution
+        same_answer(answered.detection, expected.detection)
+        assert answered.earlier_time_ns == expected.earlier_time_ns
+        assert answered.baseline_m == expected.baseline_m
+        assert len(answered.tracks) == answered.detection.diagnostics.n_after_distribution
     assert len(answered.tracks) > 100
 
 
@@ -62,7 +74,7 @@ def test_tracks_of_an_earlier_pair_are_not_shown_for_a_frame_without_one():
         answered = answer(*each)
     assert len(answered.tracks)
     answered = answer(np.zeros((360, 540), np.uint8), 300_000_000, None)
-    assert answered.observation.detection.reason is NoDetectionReason.BLACK
+    assert answered.detection.reason is NoDetectionReason.BLACK
     assert len(answered.tracks) == 0
 
 
@@ -71,11 +83,11 @@ def test_a_fixed_step_pairs_with_the_frame_so_many_before():
     clip = frames("00184.jpg", "00193.jpg", "00185.jpg", "00194.jpg")
     answers = [answer(*each) for each in clip]
     for early in answers[:2]:
-        assert early.observation.detection.reason is NoDetectionReason.NO_EARLIER_FRAME
+        assert early.detection.reason is NoDetectionReason.NO_EARLIER_FRAME
     for index, (a, b) in ((2, (clip[0], clip[2])), (3, (clip[1], clip[3]))):
-        observation = answers[index].observation
-        assert (observation.time_ns, observation.earlier_time_ns) == (b[1], a[1])
-        assert observation.baseline_m == pytest.approx(np.linalg.norm(b[2].position_m - a[2].position_m))
+        answered = answers[index]
+        assert (answered.time_ns, answered.earlier_time_ns) == (b[1], a[1])
+        assert answered.baseline_m == pytest.approx(np.linalg.norm(b[2].position_m - a[2].position_m))
     first = VoidDetector(PARAMS).detect(
         clip[0][0],
         clip[2][0],
@@ -83,7 +95,7 @@ def test_a_fixed_step_pairs_with_the_frame_so_many_before():
         later_from_earlier=clip[2][2].world_from_camera.T @ clip[0][2].world_from_camera,
         translation_earlier=clip[0][2].world_from_camera.T @ (clip[2][2].position_m - clip[0][2].position_m),
     )
-    same_answer(answers[2].observation.detection, first.detection)
+    same_answer(answers[2].detection, first.detection)
     np.testing.assert_array_equal(answers[2].tracks.end_px, first.tracks.end_px)
 
 
@@ -96,7 +108,7 @@ def test_the_callers_image_may_change_after_the_call():
                 picture[:] = 0
         return answered
 
-    same_answer(play(spoil=True).observation.detection, play(spoil=False).observation.detection)
+    same_answer(play(spoil=True).detection, play(spoil=False).detection)
 
 
 def test_a_step_below_one_is_refused():
@@ -119,12 +131,12 @@ def test_names_of_any_shape_can_be_sorted_together():
 def test_a_picture_has_even_sides_and_says_which_frame_it_is(size):
     grey = np.full(size, 120, np.uint8)
     nothing = NoDetection(NoDetectionReason.NO_MOTION, "", Diagnostics())
-    answered = Answered(Observation(nothing, 0), Tracks(np.zeros((0, 2)), np.zeros((0, 2))))
+    answered = Answered.of(Observation(nothing, 0), Tracks(np.zeros((0, 2)), np.zeros((0, 2))))
     picture = annotated(grey, answered, 3, 0.3)
     assert picture.shape[0] % 2 == picture.shape[1] % 2 == 0
     assert picture.shape[1] >= 400
     assert (annotated(grey, answered, 4, 0.3) != picture).any()
-    wall = Answered(Observation(SinglePlane(None, Diagnostics()), 0), answered.tracks)
+    wall = Answered.of(Observation(SinglePlane(None, Diagnostics()), 0), answered.tracks)
     assert (annotated(grey, wall, 3, 0.3) != picture).any()
 
 
@@ -136,3 +148,65 @@ def test_a_picture_of_another_size_is_fitted_whole_and_in_proportion():
     columns = np.nonzero(wide.any(axis=(0, 2)))[0]
     assert (columns.min(), columns.max()) == (125, 174)
     assert fitted(np.full((1, 500, 3), 255, np.uint8), (10, 10)).any()
+
+
+@pytest.mark.parametrize("name", ["straight", "flow_balance", "line_vp"])
+def test_a_rival_answers_the_pairs_that_the_detector_would(name):
+    answer = by_rival(METHODS[name](PARAMS), PARAMS, CAMERA)
+    first, second = frames("00184.jpg", "00185.jpg")
+    nothing, found = answer(*first), answer(*second)
+    assert nothing.detection.reason is NoDetectionReason.NO_EARLIER_FRAME
+    assert (nothing.answer.kind, nothing.answer.reason) == ("none", "no_earlier_frame")
+    (before, _, at_a), (now, _, at_b) = first, second
+    pair = PairInput(
+        before,
+        now,
+        CAMERA,
+        at_b.world_from_camera.T @ at_a.world_from_camera,
+        at_a.world_from_camera.T @ (at_b.position_m - at_a.position_m),
+        at_b.world_from_camera,
+    )
+    assert found.answer == METHODS[name](PARAMS).answer(pair)
+    assert (found.detection, found.earlier_time_ns) == (None, 0)
+    assert found.baseline_m == pytest.approx(np.linalg.norm(at_b.position_m - at_a.position_m))
+
+
+def test_a_rivals_picture_has_its_mark_or_its_reason():
+    grey = np.full((240, 480), 120, np.uint8)
+
+    def shown(answer):
+        return annotated(grey, Answered(answer, None, 0, None, None, no_tracks()), 0, 0.0)
+
+    left, right, silent = (
+        shown(Answer("flow_balance", (100.0, 150.0))),
+        shown(Answer("flow_balance", (380.0, 150.0))),
+        shown(Answer("none", reason="no_vanishing_point")),
+    )
+    plain = int(0.6 * 120)
+    for picture, columns in ((left, slice(80, 120)), (right, slice(360, 400))):
+        marked = np.argwhere((picture[70:] != plain).any(axis=2))
+        assert 80 <= marked.mean(axis=0)[0] + 10 <= 160
+        assert columns.start <= marked.mean(axis=0)[1] < columns.stop
+    assert (silent[70:] == plain).all(), "no mark"
+    assert (silent[:40] != left[:40]).any(), "other words"
+
+
+def test_panels_stand_side_by_side_each_with_its_name():
+    grey = np.full((240, 480), 120, np.uint8)
+    answered = {
+        name: Answered(Answer(name, (100.0, 150.0)), None, 0, None, None, no_tracks())
+        for name in ("straight", "flow_balance", "line_vp", "fourth")
+    }
+    alone = annotated(grey, answered["straight"], 1, 0.1)
+    assert np.array_equal(side_by_side(grey, {"straight": answered["straight"]}, 1, 0.1), alone)
+    height, width = alone.shape[:2]
+    for count in (2, 3, 4):
+        picture = side_by_side(grey, dict(list(answered.items())[:count]), 1, 0.1)
+        assert np.array_equal(picture[:height, :width], alone)
+        rows, columns = -(-count // PANELS_A_ROW), min(count, PANELS_A_ROW)
+        assert picture.shape[0] // height == rows
+        assert columns * width <= picture.shape[1] < (columns + 1) * width
+        assert picture.shape[0] % 2 == picture.shape[1] % 2 == 0
+        label = picture[height : height + 24, :width]
+        assert label.max() == 255
+        assert label.min() < 100, "its name below it"

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from detector.cli import main
+from detector.commands.stopping import stop_request
 
 OFFICE = Path(__file__).parents[2] / "data" / "pairs" / "office"
 KEYS = {
-    "frame", "file", "time_s", "earlier_time_s", "baseline_m", "kind", "x_px", "y_px", "reason", "detail",
+    "frame", "file", "method", "time_s", "earlier_time_s", "baseline_m", "kind", "x_px", "y_px", "reason", "detail",
     "time_to_contact_frames", "time_to_contact_spread_frames", "time_to_contact_samples", "time_to_contact_s",
     "time_to_contact_spread_s", "distance_m", "distance_spread_m", "confidence", "diagnostics",
 }  # fmt: skip
@@ -115,11 +116,48 @@ def test_the_parallax_method_draws_its_map_where_poses_are_known(capsys, clip, t
     corner = pictures[("--method", "parallax")][-40:, -40:]
     assert np.median(corner) > 200, "the map from above, on white"
     assert np.median(pictures[()][-40:, -40:]) < 200
-    code, out, err = run(
-        capsys, clip, "-o", tmp_path / "n.mp4", "--method", "parallax", "--baseline-frames", "1"
-    )
-    assert (code, out) == (2, "")
-    assert "--baseline-frames" in err
+
+
+def test_several_methods_are_panels_of_one_film_and_lines_of_their_own(capsys, clip, tmp_path):
+    add_poses(clip)
+    out_file, lines = tmp_path / "o.mp4", tmp_path / "lines"
+    names = ["paper", "parallax", "straight", "flow_balance", "line_vp"]
+    more = ["--method", "paper,parallax, straight", "--method", "flow_balance,line_vp", "--limit", "2"]
+    code, out, err = run(capsys, clip, "-o", out_file, "--json-lines", lines, *more)
+    assert (code, err) == (0, "")
+    records = records_of(lines)
+    assert [(r["frame"], r["method"]) for r in records] == [(n, name) for n in (0, 1) for name in names]
+    assert all(set(record) == KEYS for record in records)
+    assert {r["reason"] for r in records[:5]} == {"no_earlier_frame"}, "all have the same pairs"
+    second = {r["method"]: r for r in records[5:]}
+    assert {r["earlier_time_s"] for r in second.values()} == {0.0}
+    assert len({r["baseline_m"] for r in second.values()}) == 1
+    assert (second["straight"]["kind"], second["straight"]["x_px"]) == ("straight_ahead", 269.5)
+    assert second["straight"]["diagnostics"] is None
+    assert second["paper"]["diagnostics"]["n_after_angle"] >= 100
+    for name in names:
+        kind = second[name]["kind"]
+        assert f"{name}: " + ("none 2" if kind == "none" else f"none 1, {kind} 1") in out
+    first, _ = pictures_of(out_file)
+    assert first.shape[1] > 3 * 540
+    assert first.shape[0] > 2 * 360
+
+
+def test_a_method_named_wrongly_is_one_clear_line(capsys, clip, tmp_path):
+    out = tmp_path / "n.mp4"
+    known = "allowed are paper, parallax, straight, flow_balance, line_vp"
+    for arguments, words in (
+        (("--method", "magic"), f"--method: found 'magic', {known}"),
+        (("--method", "paper,"), f"--method: found '', {known}"),
+        (("--method", "paper", "--method", "line_vp,paper"), "--method: found paper 2 times"),
+        (("--method", "parallax", "--baseline-frames", "1"), "--baseline-frames: only with --method paper"),
+        (("--method", "paper,line_vp", "--baseline-frames", "1"), "--baseline-frames: only with"),
+    ):
+        code, printed, err = run(capsys, clip, "-o", out, *arguments)
+        assert (code, printed) == (2, ""), arguments
+        assert len(err.splitlines()) == 1, err
+        assert words in err, err
+    assert not out.exists()
 
 
 def test_a_folder_that_holds_its_images_in_a_folder_of_that_name(capsys, clip, tmp_path):
@@ -221,16 +259,18 @@ def test_a_command_line_that_is_none_is_refused(capsys, clip, arguments):
     assert arguments[0] in capsys.readouterr().err
 
 
-def test_an_interrupt_leaves_a_file_that_plays(clip, tmp_path):
+@pytest.mark.parametrize(("ended_by", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_leaves_a_file_that_plays(clip, tmp_path, ended_by, code):
     for number in range(12, 1000):
         (clip / f"{number}.jpg").symlink_to(clip / "9.jpg")
     out, lines = tmp_path / "o.mp4", tmp_path / "lines"
-    # A process started by one that ignores the signal would ignore it too.
-    code = (
+    # A process started by one that ignores the signals would ignore them too.
+    program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "signal.signal(signal.SIGTERM, signal.SIG_DFL); "
         "from detector.cli import main; sys.exit(main(sys.argv[1:]))"
     )
-    command = [sys.executable, "-c", code, "video", clip, "-o", out, "--json-lines", lines]
+    command = [sys.executable, "-c", program, "video", clip, "-o", out, "--json-lines", lines]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline = time.monotonic() + 60.0
@@ -238,12 +278,43 @@ def test_an_interrupt_leaves_a_file_that_plays(clip, tmp_path):
                 assert process.poll() is None, process.communicate()
                 assert time.monotonic() < deadline
                 time.sleep(0.02)
-            process.send_signal(signal.SIGINT)
+            process.send_signal(ended_by)
             _, err = process.communicate(timeout=60)
         finally:
             process.kill()
-    assert process.returncode == 130
+    assert process.returncode == code
     written = len(pictures_of(out))
     assert 4 < written < 1000
     assert err.splitlines() == [f"detector: interrupted: {out} holds {written} frames"]
     assert len(records_of(lines)) == written, "the frame in hand is finished"
+
+
+@pytest.fixture
+def usual_signals():
+    """As a shell starts a program, whatever the tests were started by."""
+    usual = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield usual
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_second_signal_does_not_wait_for_the_frame_but_for_the_file(usual_signals):
+    with stop_request() as stop:
+        assert stop.by is None
+        signal.raise_signal(signal.SIGTERM)
+        assert (stop.by, stop.exit_code) == (signal.SIGTERM, 143)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        stop.hurry = False
+        signal.raise_signal(signal.SIGINT)  # noted, no more
+        assert stop.exit_code == 143, "the first one says"
+    assert {number: signal.getsignal(number) for number in usual_signals} == usual_signals
+
+
+def test_a_signal_that_was_told_to_be_ignored_stays_so(usual_signals):
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    with stop_request() as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.by is None
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN

@@ -17,6 +17,7 @@ rules=/etc/udev/rules.d/70-$name.rules
 sysusers=/etc/sysusers.d/$name.conf
 command_link=/usr/local/bin/companion
 extras=web # small, and the live page is then switched on by the configuration alone
+quicker=fast # an event loop that takes less of a core; without it the service is the same
 back_off_since=254 # the first systemd with RestartSteps=
 
 fail() {
@@ -148,12 +149,19 @@ say "the program and what it needs"
 pip=("$prefix/bin/python" -m pip --quiet --disable-pip-version-check --no-cache-dir)
 if [ -n "$wheels" ]; then
     newest="$(find "$wheels" -name 'void_companion-*.whl' | sort -V | tail -n 1)"
-    "${pip[@]}" install --no-index --find-links "$wheels" "$newest[$extras]"
+    source=(--no-index --find-links "$wheels")
+    "${pip[@]}" install "${source[@]}" "$newest[$extras]"
     # Same version, other build: pip would leave the old one.
     "${pip[@]}" install --no-index --no-deps --force-reinstall "$newest"
 else
+    source=()
     "${pip[@]}" install "$here[$extras]"
     "${pip[@]}" install --no-deps --force-reinstall "$here"
+fi
+# Of what is installed by now: nothing of ours is fetched or built again. Only wheels: a board has no compiler, or takes minutes.
+if ! why="$("${pip[@]}" install "${source[@]}" --only-binary=:all: "${name}[$quicker]" 2>&1)"; then
+    say "without the extra $quicker: there is no wheel of it for this machine. All works; passing messages on takes more of a core"
+    say "      (pip: $(echo "$why" | sed -n '$p'))"
 fi
 "$prefix/bin/companion" --help >/dev/null
 share="$prefix/share/$name"

@@ -92,9 +92,14 @@ def test_the_live_page_is_installed_with_the_service():
     assert extras is not None
     with (ROOT / "pyproject.toml").open("rb") as project:
         assert set(extras[1].split(",")) <= set(tomllib.load(project)["project"]["optional-dependencies"])
-    carried = re.search(r'(?m)^EXTRAS: Final = "(.*)"$', (ROOT / "scripts" / "vm" / "wheels.py").read_text())
+    quicker = re.search(r"(?m)^quicker=(\S+)", INSTALLER.read_text())
+    assert quicker is not None
+    fetching = (ROOT / "scripts" / "vm" / "wheels.py").read_text()
+    carried = re.search(r"(?m)^EXTRAS: Final = \((.*)\)$", fetching)
     assert carried is not None
-    assert carried[1] == extras[1]
+    assert carried[1].replace('"', "").split(", ") == [*extras[1].split(","), quicker[1]]
+    assert f'OPTIONAL_EXTRAS: Final = frozenset({{"{quicker[1]}"}})' in fetching
+    assert f"'.[{extras[1]},{quicker[1]}]'" in (ROOT / "docs" / "install.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -124,3 +129,33 @@ def test_what_the_page_saves_and_a_ground_station_sets_goes_with_the_state_folde
     )
     assert "/var/lib/$name" in removal.split()
     assert "-c /etc/void-companion/config.toml" in start  # config.page.toml is named after it
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_where_there_is_no_wheel_of_the_quicker_event_loop_it_is_installed_without(tmp_path, is_there):
+    (step,) = re.findall(r"(?ms)^if ! why=.*?^fi$", INSTALLER.read_text())
+    pip = tmp_path / "pip"
+    pip.write_text(
+        f'#!/bin/sh\necho "$@" >>{tmp_path}/asked\n'
+        + (
+            ""
+            if is_there
+            else 'echo "ERROR: one" >&2; echo "ERROR: No matching distribution found" >&2; exit 1\n'
+        )
+    )
+    pip.chmod(0o755)
+    before = (
+        f"set -euo pipefail\nname=void-companion quicker=fast pip=({pip}) source=(--find-links {tmp_path})\n"
+        'say() { echo "install: $*"; }\n'
+    )
+    done = subprocess.run(["/bin/bash", "-c", before + step], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "asked").read_text() == (
+        f"install --find-links {tmp_path} --only-binary=:all: void-companion[fast]\n"
+    )
+    if is_there:
+        assert done.stdout == ""
+    else:
+        first, second = done.stdout.splitlines()
+        assert first.startswith("install: without the extra fast: there is no wheel of it for this machine.")
+        assert second.endswith("(pip: ERROR: No matching distribution found)")

@@ -24,6 +24,7 @@ from detector.pipeline import PairResult, VoidDetector
 from detector.results import Detection, Diagnostics, NoDetection, NoDetectionReason
 
 PANELS_A_ROW: Final = 3
+_GAP_PX: Final = 10
 _DIGITS: Final = re.compile(r"(\d+)")
 
 
@@ -227,7 +228,11 @@ def side_by_side(
     panels = {name: annotated(image, each, number, time_s) for name, each in answered.items()}
     if len(panels) == 1:
         return next(iter(panels.values()))
-    labelled = [sheet.captioned(picture, name) for name, picture in panels.items()]
+    # Apart from the row below, whose names they would else seem to be.
+    labelled = [
+        np.pad(sheet.captioned(picture, name), ((0, _GAP_PX), (0, 0), (0, 0)), constant_values=255)
+        for name, picture in panels.items()
+    ]
     rows = [labelled[first : first + PANELS_A_ROW] for first in range(0, len(labelled), PANELS_A_ROW)]
     return _even(sheet.one_below_the_other([sheet.side_by_side(row) for row in rows]))
 

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detector.camera_model import CameraModel
+from detector.commands import side_by_side_table
 from detector.commands.detect import as_dict, kind_of
 from detector.commands.inputs import json_clean
+from detector.commands.side_by_side_table import SideBySide
 from detector.overlay import headline
 from detector.parallax.params import ParallaxParams
 from detector.parallax.pipeline import Intrinsics, ParallaxDetector, ParallaxResult
@@ -83,6 +85,8 @@ class ParallaxReport:
         How often the pair was answered for it.
     pictures
         File names of the figures, by figure.
+    side_by_side
+        What all methods say of the pair.
     """
 
     earlier: str
@@ -94,6 +98,7 @@ class ParallaxReport:
     seconds: dict[str, float]
     loops: int
     pictures: dict[str, str]
+    side_by_side: SideBySide
 
 
 def examine(
@@ -151,6 +156,7 @@ def as_json(report: ParallaxReport) -> dict[str, Any]:
         "map": _map(result),
         "gap": _gap(result),
         "seconds": {"loops": report.loops, "steps": report.seconds, "total": sum(report.seconds.values())},
+        "side_by_side": side_by_side_table.as_json(report.side_by_side),
         "pictures": report.pictures,
     }
     cleaned: dict[str, Any] = json_clean(content)
@@ -228,6 +234,7 @@ def as_markdown(report: ParallaxReport) -> str:
         "## What each step costs",
         _table(("step", "time"), cost),
         f"Medians of {report.loops} loops.",
+        *side_by_side_table.as_markdown(report.side_by_side),
     ]
     return "\n\n".join(words) + "\n"
 

@@ -15,9 +15,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from detector.evaluation.side_by_side import KnownPair
+
 _DESCRIPTION: Final = """\
 Show how the answer to one pair of images came about. Method paper: the paper's Figs. 3 to 6 as PNG, its Tables 1 and 2 as
 Markdown and JSON. Method parallax: flow with its uncertainty, ranges, and the void map over the image and from above.
+Both: what every method and rival says of the pair, side by side, and which of them is right where a groundtruth.json beside
+the images knows.
 """
 
 _EPILOG: Final = f"""\
@@ -92,6 +96,9 @@ def add(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--loops", type=_loops, default=5, metavar="N", help="loops timed of each kind (default: %(default)s)"
     )
+    parser.add_argument(
+        "--no-truth", action="store_true", help="leave a groundtruth.json beside the images aside"
+    )
     parser.set_defaults(run=_run)
 
 
@@ -102,13 +109,16 @@ def _run(options: argparse.Namespace) -> int:
         if getattr(options, name) is not None:
             raise InputError(f"--{name}: only with --method parallax")
     from detector.commands.report_document import Report, as_json, as_markdown
+    from detector.commands.side_by_side_table import side_by_side
     from detector.drawing.figures import figures
+    from detector.evaluation.methods import PairInput
     from detector.report import Pair, cost_of_loops, examine
 
     params = inputs.params_of(options)
     earlier, later = inputs.read_image(options.earlier), inputs.read_image(options.later)
     camera = inputs.camera_of(options, later.shape[1], later.shape[0])
     pair = Pair(earlier, later, camera, inputs.rotation_of(options, camera))
+    known = _known(options, later)
     _make(options.output)
     steps = examine(pair, params)
     first, other = cost_of_loops(pair, params, loops=options.loops)
@@ -122,6 +132,9 @@ def _run(options: argparse.Namespace) -> int:
         other=other,
         loops=options.loops,
         pictures=_write_pictures(options.output, figures(pair, steps, params)),
+        side_by_side=side_by_side(
+            PairInput(earlier, later, camera, pair.later_from_earlier), params, known, options.loops
+        ),
     )
     return _write_report(options.output, as_json(report), as_markdown(report))
 
@@ -136,7 +149,9 @@ def _run_parallax(options: argparse.Namespace) -> int:
         as_markdown,
         examine,
     )
+    from detector.commands.side_by_side_table import side_by_side
     from detector.drawing.parallax_figures import figures
+    from detector.evaluation.methods import PairInput
 
     params = inputs.params_of(options)
     earlier, later = inputs.read_image(options.earlier), inputs.read_image(options.later)
@@ -145,8 +160,14 @@ def _run_parallax(options: argparse.Namespace) -> int:
     if options.translation is not None and rotation is None:
         raise InputError("--translation: needs --rotation too: it is given in the earlier camera's axes")
     translation_m = None if options.translation is None else np.array(options.translation, np.float64)
+    least_px = 16  # of a camera's side: else none can be assumed either
+    if camera is None and min(later.shape) < least_px:
+        raise InputError(
+            f"{options.later}: found {later.shape[1]} x {later.shape[0]} px, needed are {least_px} x {least_px} and more"
+        )
     source = "field_of_view" if options.hfov is not None else "calibration"
     pair = ParallaxPair(earlier, later, camera, source, rotation, translation_m)
+    known = _known(options, later)
     _make(options.output)
     result, seconds = examine(pair, params, loops=options.loops)
     report = ParallaxReport(
@@ -159,8 +180,19 @@ def _run_parallax(options: argparse.Namespace) -> int:
         seconds=seconds,
         loops=options.loops,
         pictures=_write_pictures(options.output, figures(later, result)),
+        side_by_side=side_by_side(
+            PairInput(earlier, later, camera, rotation, translation_m), params, known, options.loops
+        ),
     )
     return _write_report(options.output, as_json(report), as_markdown(report))
+
+
+def _known(options: argparse.Namespace, later: NDArray[np.uint8]) -> KnownPair | None:
+    from detector.commands.side_by_side_table import known_pair
+
+    if options.no_truth:
+        return None
+    return known_pair(options.earlier, options.later, (later.shape[1], later.shape[0]))
 
 
 def _write_pictures(folder: Path, drawn: dict[str, NDArray[np.uint8]]) -> dict[str, str]:

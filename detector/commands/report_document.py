@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from detector.commands import side_by_side_table
 from detector.commands.detect import as_dict, kind_of
 from detector.commands.inputs import json_clean
+from detector.commands.side_by_side_table import SideBySide
 from detector.overlay import headline
 from detector.report import P_SHOWN, LoopCost, Steps, votes
 
@@ -54,6 +56,8 @@ class Report:
         Cost of the first loop and of the others, each the median of ``loops``.
     pictures
         File names of the figures, by figure.
+    side_by_side
+        What all methods say of the pair.
     """
 
     earlier: str
@@ -65,6 +69,7 @@ class Report:
     other: LoopCost
     loops: int
     pictures: dict[str, str]
+    side_by_side: SideBySide
 
 
 def as_json(report: Report) -> dict[str, Any]:
@@ -124,6 +129,7 @@ def as_json(report: Report) -> dict[str, Any]:
             }
             for vote in votes(steps)
         ],
+        "side_by_side": side_by_side_table.as_json(report.side_by_side),
         "pictures": report.pictures,
     }
     cleaned: dict[str, Any] = json_clean(content)
@@ -172,6 +178,7 @@ def as_markdown(report: Report) -> str:
             _cost_rows(report.first, report.other),
         ),
         f"Medians of {report.loops} loops. {_NOTE_ON_COSTS}",
+        *side_by_side_table.as_markdown(report.side_by_side),
     ]
     for name, file in report.pictures.items():
         words += [f"![{name}]({file})", f"*{CAPTIONS[name]}*"]

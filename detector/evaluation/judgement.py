@@ -230,6 +230,23 @@ def judge_lines(
     )
 
 
+def is_right_answer(verdict: Verdict) -> bool | None:
+    """Return whether an answer of any kind is right; None where the truth does not say, and for silence, which is neither.
+
+    Without motion silence alone is right. "Single plane" is right before one; a direction where :func:`is_right` says so, else, where
+    only a plane is known of, it is wrong.
+    """
+    if verdict.no_motion_truth:
+        return verdict.kind == NONE
+    if verdict.kind == NONE:
+        return None
+    if verdict.kind == SINGLE_PLANE:
+        return None if verdict.near_wall_limit else verdict.single_plane_truth
+    if verdict.right is None and verdict.single_plane_truth:
+        return False
+    return verdict.right
+
+
 def is_single_plane(truth: Truth) -> bool | None:
     """Return whether a plane or wall fills the view: true where any mark says so, None where no mark says anything."""
     depth = truth.depth

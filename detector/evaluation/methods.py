@@ -27,6 +27,9 @@ NONE: Final = "none"
 _BALANCE_FLOW: Final = ParallaxParams(width_px=320)
 _BALANCE_HFOV_DEG: Final = 70.0
 _BALANCE_STILL_PX: Final = 0.2
+_BALANCE_LEAST_PX: Final = 64
+_LEAST_CAMERA_PX: Final = 16
+"""Of the side of a camera's picture (:class:`detector.camera_model.CameraModel`): for less not even one can be assumed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +165,8 @@ class ParallaxMethod(_Lines):
 
     def answer(self, pair: PairInput, /) -> Answer:
         """Return the method's answer. What it says of the focus of expansion is estimated, also where it was told the motion: that is a prior."""
+        if pair.camera is None and min(pair.later.shape) < _LEAST_CAMERA_PX:
+            return Answer(NONE, reason="wrong_size")
         result = self._detector.detect(
             pair.earlier,
             pair.later,
@@ -183,6 +188,11 @@ class FlowBalance(_Lines):
     def answer(self, pair: PairInput, /) -> Answer:
         """Return the balanced direction."""
         height_px, width_px = pair.later.shape
+        usable = pair.earlier.shape == pair.later.shape and min(height_px, width_px) >= _BALANCE_LEAST_PX
+        if not usable or (
+            pair.camera is not None and (pair.camera.width_px, pair.camera.height_px) != (width_px, height_px)
+        ):
+            return Answer(NONE, reason="wrong_size")
         camera = pair.camera or CameraModel.from_hfov(width_px, height_px, _BALANCE_HFOV_DEG)
         turn = np.eye(3) if pair.later_from_earlier is None else pair.later_from_earlier
         field = measure_flow(pair.earlier, pair.later, camera, turn, _BALANCE_FLOW)

@@ -151,6 +151,32 @@ def enough_depth(images: ImageSet, pairs: Iterable[Pair], min_valid_frac: float)
     return tuple(pair for pair in pairs if is_enough(pair))
 
 
+def scene_of(
+    images: ImageSet, pair: Pair, image_size_px: tuple[int, int], *, turned_back: bool = False
+) -> Scene:
+    """Return what an answer to a pair of a set is judged against.
+
+    Parameters
+    ----------
+    images, pair
+        Which.
+    image_size_px
+        Width and height.
+    turned_back
+        Whether the later image was turned into the orientation of the earlier one.
+    """
+    return Scene(
+        truth=images.truth_of(pair),
+        image_size_px=image_size_px,
+        camera=images.camera,
+        motion=images.motion_of(pair),
+        focus_px=images.focus_of(pair),
+        earlier_contact_s=images.frames[pair.a].time_to_contact_s,
+        later_contact_s=images.frames[pair.b].time_to_contact_s,
+        turned_back=turned_back,
+    )
+
+
 def summary(evaluation: Evaluation, *, seed: int = 0) -> dict[str, Any]:
     """Return the figures of one set as plain values (the keys of ``detector evaluate --json``, docs/evaluation.md).
 
@@ -240,17 +266,7 @@ def _judge_pair(
     begin = timer()
     answer = method.answer(PairInput(earlier, later, images.camera, rotation, translation_m, level))
     seconds = timer() - begin
-    frame_a, frame_b = images.frames[pair.a], images.frames[pair.b]
-    scene = Scene(
-        truth=images.truth_of(pair),
-        image_size_px=(later.shape[1], later.shape[0]),
-        camera=images.camera,
-        motion=motion,
-        focus_px=images.focus_of(pair),
-        earlier_contact_s=frame_a.time_to_contact_s,
-        later_contact_s=frame_b.time_to_contact_s,
-        turned_back=settings.derotated,
-    )
+    scene = scene_of(images, pair, (later.shape[1], later.shape[0]), turned_back=settings.derotated)
     return judge(with_focus(answer, images.camera), pair, scene, seconds)
 
 

@@ -72,6 +72,11 @@ def test_with_the_motion_it_speaks_of_metres(capsys, tmp_path):
     assert report["map"]["unit"] == "m"
     assert report["answer"]["distance_m"] == pytest.approx(0.05 * report["answer"]["time_to_contact_frames"])
     assert report["motion"]["rotation_source"] == "attitude_refined"
+    assert report["side_by_side"]["told"] == ["camera", "rotation", "translation"]
+    row = report["side_by_side"]["methods"][1]
+    assert (row["method"], row["kind"], row["right"]) == ("parallax", "single_plane", True)
+    assert row["confidence"] == report["answer"]["confidence"]
+    assert "## Side by side" in (tmp_path / "report.md").read_text()
     assert "single_plane" in (tmp_path / "report.md").read_text()
 
 
@@ -102,6 +107,14 @@ def test_one_clear_line_for_what_cannot_be_used(capsys, tmp_path, arguments, wor
     assert code == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_pictures_too_small_for_any_camera_are_refused(capsys, tmp_path):
+    tiny = tmp_path / "tiny.png"
+    cv2.imwrite(str(tiny), np.full((8, 8), 90, np.uint8))
+    code, out, err = run(capsys, tiny, tiny, "-o", tmp_path / "new")
+    assert (code, out) == (2, "")
+    assert err.splitlines() == [f"detector: error: {tiny}: found 8 x 8 px, needed are 16 x 16 and more"]
 
 
 def test_settings_of_one_method_are_refused_by_the_other(capsys, tmp_path):

@@ -8,6 +8,7 @@ import cv2
 import pytest
 
 from detector.cli import main
+from detector.commands.side_by_side_table import known_pair
 from detector.params import DetectorParams
 from detector.pipeline import VoidDetector
 
@@ -102,6 +103,70 @@ def test_a_known_rotation_is_taken_out(capsys, tmp_path):
         assert run(capsys, *pair, "-o", tmp_path, "--loops", "1", "--hfov", "57.2", *more)[0] == 0
         flows.append(report_of(tmp_path)["answer"]["diagnostics"]["median_flow_px"])
     assert flows[1] < 0.8 * flows[0]
+
+
+METHODS = ["paper", "parallax", "straight", "flow_balance", "line_vp"]
+
+
+def side_by_side_of(folder):
+    text = (folder / "report.md").read_text().split("## Side by side")[1]
+    cells = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| `")]
+    return report_of(folder)["side_by_side"], {row[0].strip("`"): row for row in cells}
+
+
+def test_all_methods_stand_side_by_side_and_are_judged_where_the_truth_lies_beside_the_images(
+    capsys, tmp_path
+):
+    assert run(capsys, *BRICKS, "-o", tmp_path, "--loops", "1")[0] == 0
+    found, rows = side_by_side_of(tmp_path)
+    assert (found["loops"], found["told"], found["truth"]) == (1, [], "brickwall")
+    assert [row["method"] for row in found["methods"]] == list(rows) == METHODS
+    for row in found["methods"]:
+        wall = row["kind"] == "single_plane"
+        assert row["right"] is (None if row["kind"] == "none" else wall), "the truth is a wall"
+        word = {True: "right", False: "wrong", None: "no answer"}[row["right"]]
+        assert rows[row["method"]][-1] == word
+        assert rows[row["method"]][4] == f"{1e3 * row['seconds']:.1f} ms"
+    by_name = {row["method"]: row for row in found["methods"]}
+    answer = report_of(tmp_path)["answer"]
+    assert by_name["paper"]["kind"] == answer["kind"] == "single_plane"
+    assert by_name["paper"]["time_to_contact_frames"] == answer["time_to_contact_frames"]
+    assert by_name["straight"]["right"] is False
+    assert rows["straight"][2] == "128, 128"
+
+    assert run(capsys, *BRICKS, "-o", tmp_path, "--loops", "1", "--no-truth")[0] == 0
+    found, rows = side_by_side_of(tmp_path)
+    assert found["truth"] is None
+    assert {row[-1] for row in rows.values()} == {"not known"}
+
+
+def test_a_truth_beside_the_images_that_cannot_be_used_is_one_clear_line(capsys, tmp_path):
+    folder = tmp_path / "walk" / "images"
+    folder.mkdir(parents=True)
+    pair = [folder / f"{index}.jpg" for index in (1, 2)]
+    for file, source in zip(pair, BRICKS, strict=True):
+        file.write_bytes(Path(source).read_bytes())
+    truth = tmp_path / "walk" / "groundtruth.json"
+    frames = {f"images/{file.name}": {"no_motion": True} for file in pair}
+    for content, words in (
+        ("{", "is not valid JSON"),
+        (json.dumps({"image_size": [256, 256], "frames": 3}), "frames"),
+        (
+            json.dumps({"image_size": [64, 64], "frames": frames}),
+            "image_size: found (64, 64), 2.jpg has (256, 256)",
+        ),
+    ):
+        truth.write_text(content)
+        code, out, err = run(capsys, *pair, "-o", tmp_path / "out")
+        assert (code, out) == (2, "")
+        assert len(err.splitlines()) == 1, err
+        assert words in err
+        assert "--no-truth" in err
+        assert not (tmp_path / "out").exists()
+    truth.write_text(json.dumps({"image_size": [256, 256], "frames": frames}))
+    found = known_pair(*pair, (256, 256))
+    assert (found.pair.a, found.pair.b) == ("images/1.jpg", "images/2.jpg"), "not listed as a pair, yet known"
+    assert known_pair(pair[0], Path(BRICKS[1]), (256, 256)) is None, "of another set"
 
 
 def test_input_that_cannot_be_used_is_one_clear_line(capsys, tmp_path):

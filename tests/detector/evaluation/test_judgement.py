@@ -10,6 +10,7 @@ from detector.evaluation.dataset import Depth, FreeColumn, Motion, Pair, Plane, 
 from detector.evaluation.judgement import (
     Scene,
     has_direction_truth,
+    is_right_answer,
     is_single_plane,
     judge,
     judge_lines,
@@ -212,3 +213,22 @@ def test_where_it_is_known_how_far_the_vehicle_can_fly_that_counts_and_not_the_d
     truth = Truth(depth=Depth(column_profile_m=(2.0, 9.0, 3.0)), free_distance_profile_m=(2.0, 1.5, 3.0))
     assert profile_ratio(truth, 15.0, 30) == pytest.approx(0.5)
     assert profile_ratio(truth, 25.0, 30) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("truth", "direction", "plane", "silence"),
+    [
+        (Truth(), None, None, None),
+        (Truth(vp=(200.0, 100.0)), True, None, None),
+        (Truth(vp=(20.0, 100.0)), False, None, None),
+        (Truth(single_plane=True), False, True, None),
+        (Truth(vp=(200.0, 100.0), single_plane=False), True, False, None),
+        (Truth(vp=(200.0, 100.0), single_plane=True), True, True, None),  # the truth has room for both
+        (Truth(vp=(200.0, 100.0), best_free_distance_m=2.9), True, None, None),  # neither wall nor free
+        (Truth(no_motion=True), False, False, True),
+    ],
+)
+def test_an_answer_of_any_kind_is_right_wrong_or_not_known(truth, direction, plane, silence):
+    answers = at(200.0), Answer("single_plane"), Answer("none", reason="no_motion")
+    found = [is_right_answer(verdict(answer, truth)) for answer in answers]
+    assert found == [direction, plane, silence]

@@ -152,3 +152,25 @@ def test_the_lines_of_parallax_are_whole_image_segments():
     assert found is not None
     assert np.hypot(found[0] - 355.0, found[1] - 245.0) < 6.0
     assert METHODS["parallax"](PARAMS).vanishing_point(np.full((480, 640), 90, np.uint8)) is None
+
+
+@pytest.mark.parametrize("size", [(1, 1), (8, 8), (20, 20), (64, 64)])
+@pytest.mark.parametrize("name", ["paper", "parallax", "flow_balance", "line_vp"])
+def test_frames_of_any_size_have_an_answer(name, size):
+    noise = np.random.default_rng(0).integers(0, 255, size, dtype=np.uint8)
+    answer = METHODS[name](PARAMS).answer(PairInput(noise, noise))
+    assert (answer.point_px is None) == (answer.reason is not None)
+    if min(size) < 64:  # in more noise than that lines may meet by chance
+        assert answer.point_px is None
+
+
+@pytest.mark.parametrize("wrong", ["earlier", "camera"])
+def test_flow_balance_says_when_frames_or_camera_are_of_another_size(wrong):
+    earlier, later = approach()
+    given = {"earlier": earlier, "later": later, "camera": None}
+    given |= {
+        "earlier": {"earlier": earlier[:-8]},
+        "camera": {"camera": CameraModel.from_hfov(320, 200, 70.0)},
+    }[wrong]
+    answer = METHODS["flow_balance"](PARAMS).answer(PairInput(**given))
+    assert (answer.kind, answer.reason) == ("none", "wrong_size")

@@ -57,12 +57,16 @@ class SweptDepth:
         (h, w) by how much the best plane fits better than any other that is not its neighbour, in units of the local contrast.
     sigma
         Standard deviation of ``inverse_depth`` where it is clear, 1/baseline.
+    further_unseen
+        (h, w) where the earlier picture does not hold all places that lie further away than ``inverse_depth`` says: the true one may be among them, and whatever else looks alike
+        is taken for it.
     """
 
     camera: CameraModel
     inverse_depth: NDArray[np.float32]
     margin: NDArray[np.float32]
     sigma: float
+    further_unseen: NDArray[np.bool_]
 
     def at(self, rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return inverse depth and margin (N,) in the cells of rays; margin 0 outside the picture.
@@ -72,16 +76,16 @@ class SweptDepth:
         rays
             (N, 3) in the later camera's axes, any length.
         """
-        column, row = self._cells(rays).T
-        height, width = self.inverse_depth.shape
-        with np.errstate(invalid="ignore"):
-            inside = (column > -0.5) & (column < width - 0.5) & (row > -0.5) & (row < height - 0.5)
-        at_row = np.where(inside, np.rint(np.nan_to_num(row)), 0).astype(np.intp)
-        at_column = np.where(inside, np.rint(np.nan_to_num(column)), 0).astype(np.intp)
+        at_row, at_column, inside = self._nearest(rays)
         return (
             np.where(inside, self.inverse_depth[at_row, at_column], 0.0).astype(np.float64),
             np.where(inside, self.margin[at_row, at_column], 0.0).astype(np.float64),
         )
+
+    def further_unseen_at(self, rays: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return ``further_unseen`` (N,) in the cells of rays (N, 3); outside the picture that of the nearest cell."""
+        row, column, _ = self._nearest(rays)
+        return np.asarray(self.further_unseen[row, column], np.bool_)
 
     def smooth_at(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the inverse depth (N,) between the cells, a little smoothed: what the flow starts from, without steps."""
@@ -91,6 +95,15 @@ class SweptDepth:
             smooth, cells[:, None, 0], cells[:, None, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
         return np.asarray(found, np.float64).reshape(-1)
+
+    def _nearest(
+        self, rays: NDArray[np.float64]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+        cells = np.nan_to_num(self._cells(rays), nan=-1.0)
+        most = np.array(self.inverse_depth.shape[::-1]) - 1
+        inside = ((cells > -0.5) & (cells < most + 0.5)).all(axis=1)
+        column, row = np.clip(np.rint(cells), 0, most).astype(np.intp).T
+        return row, column, np.asarray(inside, np.bool_)
 
     def _cells(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         return (self.camera.ray_to_pixel(rays) - _CELL_PX // 2) / _CELL_PX
@@ -142,6 +155,7 @@ def sweep_depth(
         np.interp(_between(total, best), np.arange(count), inverse).astype(np.float32),
         np.where(clear, margin / _PATHS, 0.0).astype(np.float32),
         params.swept_sigma if count > 1 else np.inf,
+        np.asarray(further_unseen, np.bool_),
     )
 
 

@@ -89,7 +89,9 @@ def measure_guided_flow(
         turned = small.ray_to_pixel(np.nan_to_num(small.pixel_to_ray(source)) @ turn.T)
         seen = np.asarray(np.isfinite(turned).all(axis=1), np.bool_)
         found[textured] = np.where(seen[:, None], turned, found[textured])
-        believed[textured] = good & inside & seen
+        # What was out of the earlier picture has no match there, and a tile or a brick that looks like it is no match.
+        lost = swept.further_unseen_at(small.pixel_to_ray(seeds.astype(np.float64)))
+        believed[textured] = good & inside & seen & ~lost
     offset = 0.5 * (reduction - 1)
     return FlowField(
         later_px=at.astype(np.float64) * reduction + offset,

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from detector.camera_model import CameraModel
 from detector.parallax.depth_sweep import sweep_depth
 from detector.parallax.egomotion import Egomotion, estimate_egomotion
 from detector.parallax.flow_field import FlowField, measure_flow
@@ -94,3 +95,39 @@ def test_fine_even_texture_that_is_matched_at_a_wrong_place_is_not_believed() ->
     without = measure_guided_flow(earlier, later, CAMERA, np.eye(3), still, far, lax).believed.mean()
     assert without > 0.05
     assert believed < 0.5 * without
+
+
+def tiled_wall(camera: CameraModel, position_m: np.ndarray, wall_from_camera: np.ndarray) -> np.ndarray:
+    """A wall of square tiles 4 m ahead of the origin, each like the other, in a picture."""
+    x, y = np.meshgrid(np.arange(camera.width_px, dtype=float), np.arange(camera.height_px, dtype=float))
+    rays = camera.pixel_to_ray(np.stack([x.ravel(), y.ravel()], axis=1)) @ wall_from_camera.T
+    at = position_m + rays * ((4.0 - position_m[2]) / rays[:, 2])[:, None]
+    tile = np.random.default_rng(8).uniform(0.0, 255.0, (40, 40)).astype(np.float32)
+    tile = cv2.GaussianBlur(np.tile(tile, (3, 3)), (0, 0), 1.5)[40:80, 40:80] * 2.0 - 128.0
+    size = camera.height_px, camera.width_px
+    column, row = (np.mod(at[:, i] / 0.5, 1.0).reshape(size).astype(np.float32) * 39.0 for i in (0, 1))
+    return np.clip(cv2.remap(tile, column, row, cv2.INTER_LINEAR), 0, 255).astype(np.uint8)
+
+
+def test_a_tile_that_was_out_of_the_earlier_picture_is_not_taken_for_a_nearer_one_that_was_in_it() -> None:
+    turned = rotation_deg(0.0, -25.0, 0.0)  # later axes in those of the wall: the strip on the left is new
+    step_m = np.array([0.25, 0.0, 0.0])  # to the right: the nearer, the further to the right it was
+    earlier, later = tiled_wall(CAMERA, np.zeros(3), np.eye(3)), tiled_wall(CAMERA, step_m, turned)
+    turn, direction = turned.T, turned.T @ step_m / 0.25
+    motion = replace(
+        first_look(corridor_view()),
+        later_from_earlier=turn,
+        direction_later=direction,
+        correction=np.eye(3),
+    )
+    swept = sweep_depth(earlier, later, CAMERA, turn, direction, PARAMS)
+    field = measure_guided_flow(earlier, later, CAMERA, turn, motion, swept, PARAMS)
+    rays = CAMERA.pixel_to_ray(field.later_px) @ turned.T
+    at = step_m + rays * ((4.0 - step_m[2]) / rays[:, 2])[:, None]
+    was_out = CAMERA.ray_to_pixel(at)[:, 0] < -4.0
+    assert was_out.sum() > 50
+    blind = replace(swept, further_unseen=np.zeros_like(swept.further_unseen))
+    trusting = measure_guided_flow(earlier, later, CAMERA, turn, motion, blind, PARAMS)
+    assert trusting.believed[was_out].sum() >= 3
+    assert field.believed[was_out].sum() == 0
+    assert field.believed[~was_out].sum() > 0.5 * trusting.believed[~was_out].sum()

@@ -8,6 +8,7 @@ of the best gap is kept as a place in local NED, and each report that sees it ag
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from companion.guidance.coordinates import wrap_rad
@@ -26,11 +27,17 @@ _SAME_RAD = math.radians(12.0)
 """A gap seen again within this angle of the kept one is the same gap."""
 _SIGHTINGS = 2
 """Reports that must have seen it: one alone may have followed a wrong point."""
+_ESTABLISHED = 4
+"""Seen so often, a way is not shortened by a report that sees less far along it: near a door's frame one point beside the way hides it."""
 _REACHED_M = 0.5
 _CONTRADICTIONS = 2
 _KEPT_NS = 12_000_000_000
 _BETTER_M = 1.0
 """By how much another gap must bring the vehicle nearer to the goal to replace the kept one."""
+
+
+def _nothing_remembered(_azimuth_rad: float) -> float | None:
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +121,7 @@ class Gaps:
         blocked: tuple[float, ...] = (),
         anywhere: bool = False,
         way_free_m: float | None = None,
+        remembered_m: Callable[[float], float | None] = _nothing_remembered,
     ) -> None:
         """Take one report's bearings.
 
@@ -129,6 +137,8 @@ class Gaps:
             Whether the way that leads furthest is wanted, also away from the goal.
         way_free_m
             What is measured free on the way to the kept gap from this report's pose, where it is known.
+        remembered_m
+            Says for an azimuth how far it is from this report's pose to what is remembered to stand there, None where nothing does.
         """
         pose = report.pose
         if pose is None:
@@ -147,6 +157,7 @@ class Gaps:
             blocked=blocked,
             anywhere=anywhere,
             now_ns=report.frame_ns,
+            remembered_m=remembered_m,
         )
         if best is None:
             return
@@ -155,6 +166,8 @@ class Gaps:
             return
         turn_rad = abs(wrap_rad(best.azimuth_rad(pose) - kept.azimuth_rad(pose)))
         if turn_rad <= _SAME_RAD:
+            if kept.sightings >= _ESTABLISHED and best.left_m(pose) < kept.left_m(pose) - _BETTER_M:
+                return  # it is kept as it was, and grows old: one frame's edge is no end of a way that many saw through
             contradictions = kept.contradictions
             self._kept = replace(best, sightings=kept.sightings + 1, contradictions=contradictions)
         elif (
@@ -178,6 +191,7 @@ def best_gap(
     blocked: tuple[float, ...],
     anywhere: bool,
     now_ns: int,
+    remembered_m: Callable[[float], float | None] = _nothing_remembered,
 ) -> Gap | None:
     """Return the best of the ways that were measured from one place, or None.
 
@@ -201,6 +215,9 @@ def best_gap(
         Whether any way will do, the longest first.
     now_ns
         Time of the frame.
+    remembered_m
+        Says for an azimuth how far it is to what is remembered to stand there, None where nothing does: a way that this
+        report alone calls free is none, for the vehicle would not be let go along it.
     """
     goal_m = math.dist(goal, (pose.north_m, pose.east_m))
     ways: list[tuple[float, float, Gap]] = []
@@ -211,6 +228,11 @@ def best_gap(
             abs(wrap_rad(bearing.azimuth_rad - b)) <= math.radians(15.0) for b in blocked
         ):
             continue
+        stands_m = remembered_m(bearing.azimuth_rad)
+        if stands_m is not None:
+            length_m = min(length_m, stands_m - margin_m)
+            if length_m < least_m:
+                continue
         if not anywhere:
             length_m = min(length_m, goal_m)
         gap = Gap(

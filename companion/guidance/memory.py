@@ -18,8 +18,10 @@ _TRACK_GAP_M = 1.0
 _REMEMBERED_SHARE = 1.0
 """Of the vehicle's width with its margins: less of the margin beside what was already passed."""
 _ANOTHER_PLACE_M = 1.0
+_SAME_RAD = math.radians(2.0)
+"""A bearing is free for the vehicle's whole width; what it says of directions this close to it is good to 4 cm at a metre."""
 _MATCH_RAD = math.radians(4.0)
-"""A bearing stands for directions this close to it (half the vehicle's width at 5 m)."""
+"""Where no bearing is that near, those this close stand for it (half the vehicle's width at 5 m)."""
 
 
 class SeenBearings:
@@ -73,16 +75,25 @@ class SeenBearings:
     def free_m(self, azimuth_rad: float, pose: Pose, speed_m_s: float, now_ns: int) -> float | None:
         """Return the free distance from the vehicle along an azimuth, or None where it is not known.
 
-        The least of the fresh measurements within 4 degrees, less their spread and less the way flown
-        along the azimuth since; not beyond a remembered obstacle.
+        The least of the fresh measurements within 2 degrees (where there is none, within 4), less their spread and less the
+        way flown along the azimuth since; not beyond a remembered obstacle.
         """
-        found = self._near.free_m(azimuth_rad, pose, now_ns)
-        for bearing, report in self._fresh(pose, speed_m_s, now_ns):
-            if abs(wrap_rad(bearing.azimuth_rad - azimuth_rad)) > _MATCH_RAD:
-                continue
-            free_m = _remaining_m(bearing, report, pose)
-            found = free_m if found is None else min(found, free_m)
-        return found
+        off = [
+            (abs(wrap_rad(bearing.azimuth_rad - azimuth_rad)), bearing, report)
+            for bearing, report in self._fresh(pose, speed_m_s, now_ns)
+        ]
+        near_rad = _SAME_RAD if any(off_rad <= _SAME_RAD for off_rad, _, _ in off) else _MATCH_RAD
+        known_m = [
+            _remaining_m(bearing, report, pose) for off_rad, bearing, report in off if off_rad <= near_rad
+        ]
+        remembered_m = self._near.free_m(azimuth_rad, pose, now_ns)
+        if remembered_m is not None:
+            known_m.append(remembered_m)
+        return min(known_m, default=None)
+
+    def remembered_m(self, azimuth_rad: float, pose: Pose, now_ns: int) -> float | None:
+        """Return how far it is along an azimuth to what is remembered to stand there; None where nothing does."""
+        return self._near.free_m(azimuth_rad, pose, now_ns)
 
     def clearer(self, azimuth_rad: float, pose: Pose, now_ns: int) -> tuple[float, float]:
         """Return the azimuth near a wanted one with most room beside what is remembered, and that room (m)."""

@@ -213,7 +213,14 @@ class Evidence:
         way_free_m = None
         if kept is not None:
             way_free_m = self.seen.free_m(kept.azimuth_rad(pose), pose, self.speed_m_s, now_ns)
-        self.gaps.add(report, goal, blocked=self.blocked, anywhere=bool(self.blocked), way_free_m=way_free_m)
+        self.gaps.add(
+            report,
+            goal,
+            blocked=self.blocked,
+            anywhere=bool(self.blocked),
+            way_free_m=way_free_m,
+            remembered_m=lambda azimuth: self.seen.remembered_m(azimuth, pose, now_ns),
+        )
 
     # ------------------------------------------------------------------ what is forgotten
 

@@ -138,3 +138,36 @@ def test_only_a_clearly_better_gap_replaces_it():
     gap = kept.usable(pose_at(0, 0), 7)
     assert gap is not None
     assert math.degrees(gap.azimuth_rad(pose_at(0, 0))) == pytest.approx(-3.0)
+
+
+def test_a_way_that_many_saw_through_is_not_shortened_by_one_that_sees_the_frame():
+    kept = gaps()
+    for t in range(4):
+        kept.add(doorway(t), GOAL)
+    far = kept.usable(pose_at(0, 0), 4)
+    assert far is not None
+    near_the_frame = report_of({9.0: 2.6, 12.0: 2.6, 15.0: 2.6}, pose=pose_at(1, 0.2, S), t_ns=S)
+    kept.add(near_the_frame, GOAL, way_free_m=2.6)
+    gap = kept.usable(pose_at(1, 0.2), S)
+    assert gap is not None
+    assert (gap.north_m, gap.east_m, gap.seen_ns) == (far.north_m, far.east_m, far.seen_ns)
+
+
+def test_one_that_few_saw_is_shortened():
+    kept = seen_twice()
+    kept.add(report_of({9.0: 4.0, 12.0: 4.0, 15.0: 4.0}, t_ns=S), GOAL)
+    gap = kept.usable(pose_at(0, 0), S)
+    assert gap is not None
+    assert gap.left_m(pose_at(0, 0)) == pytest.approx(4.0 - MARGIN_M)
+
+
+def test_a_way_on_which_something_is_remembered_ends_before_it_or_is_none():
+    def pillar(at_m: float) -> object:
+        return lambda azimuth_rad: at_m if abs(azimuth_rad - math.radians(12.0)) < 0.1 else None
+
+    shortened = of(doorway(), remembered_m=pillar(5.0))
+    assert shortened is not None
+    assert shortened.left_m(pose_at(0, 0)) <= 5.0 - MARGIN_M
+    gap = of(doorway(), remembered_m=pillar(1.0))
+    assert gap is not None
+    assert abs(math.degrees(gap.azimuth_rad(pose_at(0, 0))) - 12.0) > 5.0

@@ -11,7 +11,9 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, ClassVar, Final, Self
 
 _THREAD_VARIABLES: Final = (
@@ -20,6 +22,9 @@ _THREAD_VARIABLES: Final = (
     "MKL_NUM_THREADS",
     "NUMEXPR_NUM_THREADS",
 )
+
+
+_NONE: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 class ChildProcess:
@@ -36,7 +41,14 @@ class ChildProcess:
         self._output = output
 
     @classmethod
-    def start_module(cls, module: str, *, threads: int, send_buffer_bytes: int | None = None) -> Self:
+    def start_module(
+        cls,
+        module: str,
+        *,
+        threads: int,
+        send_buffer_bytes: int | None = None,
+        environment: Mapping[str, str] = _NONE,
+    ) -> Self:
         """Start ``python -m module PARENT_PID SOCKET_FD``. Blocks for some milliseconds.
 
         A module that calls `companion.children.parent.die_with_parent` is killed by the kernel when the *thread* that called
@@ -50,6 +62,8 @@ class ChildProcess:
             OpenMP and BLAS threads of the process; they have to be known before it imports anything.
         send_buffer_bytes
             What may wait in the kernel while the process is busy (it may grant less); None: as it is by default.
+        environment
+            Variables of this process alone; where ours has one of them set, that counts.
 
         Raises
         ------
@@ -67,7 +81,7 @@ class ChildProcess:
                     stdout=subprocess.PIPE,
                     stderr=subprocess.STDOUT,
                     pass_fds=(theirs.fileno(),),
-                    env=_environment(threads),
+                    env={**environment, **_environment(threads)},
                     start_new_session=True,  # a terminal's Ctrl-C goes to the service alone
                     bufsize=0,
                 )

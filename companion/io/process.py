@@ -11,6 +11,9 @@ from companion.config import Config
 from companion.io.messages import MAX_PACKET_BYTES, FromIo, unpack_from_io
 
 _SEND_BUFFER_BYTES: Final = 1 << 20
+_MEMORY: Final = {"MALLOC_MMAP_THRESHOLD_": str(1 << 18), "MALLOC_TRIM_THRESHOLD_": str(1 << 18)}
+"""Blocks from 256 KiB on go back to the system when they are let go of (mallopt(3)). By itself glibc raises these with the largest block that
+it has seen, and the process then keeps what a full file or a slow disk once took."""
 
 
 class IoProcess(ChildProcess):
@@ -29,7 +32,10 @@ class IoProcess(ChildProcess):
         """
         # One thread for arithmetic: it is not what this process is for, and the cores are the detector's.
         started = cls.start_module(
-            "companion.io.child_process", threads=1, send_buffer_bytes=_SEND_BUFFER_BYTES
+            "companion.io.child_process",
+            threads=1,
+            send_buffer_bytes=_SEND_BUFFER_BYTES,
+            environment=_MEMORY,
         )
         first = {"sinks": list(sinks), "config": config.model_dump_json(exclude_unset=True)}
         try:

@@ -4,6 +4,8 @@ import asyncio
 import contextlib
 import os
 import signal
+import time
+from pathlib import Path
 
 import pytest
 
@@ -23,6 +25,15 @@ async def closed(child: ChildProcess) -> None:
             await asyncio.sleep(0.01)
 
 
+def variables_of(pid: int) -> dict[str, str]:
+    """Return the environment that a process was started with; the kernel has none of it in the first moment."""
+    end_s = time.monotonic() + 30.0
+    while not (text := Path(f"/proc/{pid}/environ").read_text()):
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+    return dict(line.split("=", 1) for line in text.split("\0") if "=" in line)
+
+
 async def test_its_first_lines_are_handed_on_and_its_last_words_kept():
     child = ChildProcess.start_module(TALKER, threads=1)
     got: list[str] = []
@@ -40,6 +51,19 @@ async def test_its_first_lines_are_handed_on_and_its_last_words_kept():
     assert status == 0
     assert got == ["x" * 1000, *(f"line {n}" for n in range(49))]
     assert lines.last_words.splitlines() == [f"line {n}" for n in range(50, 60)]
+
+
+def test_it_has_variables_of_its_own_where_ours_does_not_set_them(monkeypatch):
+    monkeypatch.setenv("VOID_TEST_SET", "ours")
+    given = {"VOID_TEST_SET": "given", "VOID_TEST_NEW": "given", "OMP_NUM_THREADS": "7"}
+    child = ChildProcess.start_module(TALKER, threads=1, environment=given)
+    try:
+        found = variables_of(child.pid)
+    finally:
+        child.stop()
+    assert (found["VOID_TEST_SET"], found["VOID_TEST_NEW"]) == ("ours", "given")
+    assert found["OMP_NUM_THREADS"] == "1"
+    assert "VOID_TEST_NEW" not in os.environ
 
 
 @pytest.mark.parametrize("grace_s", [0.0, 0.2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import resource
 import time
 from pathlib import Path
@@ -105,6 +106,18 @@ def no_file_longer_than(size_bytes: int):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+async def test_it_gives_memory_back_and_the_service_is_left_alone(tmp_path, monkeypatch):
+    names = ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
+    for name in names:
+        monkeypatch.delenv(name, raising=False)
+    bench = Bench(tmp_path)
+    async with bench:
+        await until(lambda: bench.recorder()["recording"])
+        variables = Path(f"/proc/{bench.io.pid}/environ").read_text().split("\0")  # noqa: ASYNC240  of the kernel's own
+        assert {f"{name}={256 * 1024}" for name in names} <= set(variables)
+    assert not set(names) & set(os.environ)
 
 
 async def test_a_disk_that_takes_no_more_ends_the_recording_and_nothing_else(tmp_path):

@@ -16,6 +16,7 @@ from detector.evaluation.side_by_side import KnownPair, MethodAnswer, answer_sid
 from detector.params import DetectorParams
 
 _HEAD: Final = ("method", "answer", "direction (px)", "confidence", "time", "right")
+_LEAST_SHOWN_S: Final = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +144,10 @@ def _row(row: MethodAnswer) -> Sequence[str]:
         answer.kind if answer.reason is None else f"{answer.kind} ({answer.reason})",
         "" if answer.point_px is None else f"{answer.point_px[0]:.0f}, {answer.point_px[1]:.0f}",
         "" if answer.confidence is None else f"{answer.confidence:.2f}",
-        f"{row.seconds * 1e3:.1f} ms",
+        _milliseconds(row.seconds),
         "no answer" if silent else {True: "right", False: "wrong", None: "not known"}[row.right],
     )
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{seconds * 1e3:.1f} ms" if seconds >= _LEAST_SHOWN_S else "< 0.1 ms"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from detector.drawing.sheet import one_below_the_other, side_by_side
 
 _PANEL_PX: Final = (760, 520)
 _MS: Final = 1e3
+_LEGEND_ROOM: Final = 1.6
 _LINES: Final[tuple[tuple[str, str, Colour], ...]] = (
     ("literal", "literal, first loop", INK),
     ("literal_other", "literal, other loops", GREY),
@@ -44,13 +46,14 @@ _METHODS: Final[tuple[tuple[str, str, Colour], ...]] = (
 
 def performance_chart(figures: dict[str, Any]) -> NDArray[np.uint8]:
     """Return the chart of the figures of :func:`detector.bench.run`, (H, W, 3) uint8 BGR."""
-    charts = (
-        _against_size(figures, "Time of one pair", _LINES),
-        _against_points(figures),
-        _against_size(figures, "Methods and rivals", _METHODS),
-    )
-    whole, points, methods = (draw_chart(chart, *_PANEL_PX) for chart in charts)
-    return one_below_the_other([side_by_side([whole, points]), methods])
+    methods = _against_size(figures, "Methods and rivals", _METHODS)
+    if methods.series:
+        # Their lines are flat and the longest lies on top, where the legend needs room.
+        highest = max(float(np.nanmax(series.y)) for series in methods.series if isinstance(series, Series))
+        methods = replace(methods, y_range=(0.0, _LEGEND_ROOM * highest))
+    charts = (_against_size(figures, "Time of one pair", _LINES), _against_points(figures), methods)
+    whole, points, below = (draw_chart(chart, *_PANEL_PX) for chart in charts)
+    return one_below_the_other([side_by_side([whole, points]), below])
 
 
 def _against_size(figures: dict[str, Any], title: str, lines: tuple[tuple[str, str, Colour], ...]) -> Chart:

@@ -126,13 +126,14 @@ def test_all_methods_stand_side_by_side_and_are_judged_where_the_truth_lies_besi
         assert row["right"] is (None if row["kind"] == "none" else wall), "the truth is a wall"
         word = {True: "right", False: "wrong", None: "no answer"}[row["right"]]
         assert rows[row["method"]][-1] == word
-        assert rows[row["method"]][4] == f"{1e3 * row['seconds']:.1f} ms"
+        assert rows[row["method"]][4] in (f"{1e3 * row['seconds']:.1f} ms", "< 0.1 ms")
     by_name = {row["method"]: row for row in found["methods"]}
     answer = report_of(tmp_path)["answer"]
     assert by_name["paper"]["kind"] == answer["kind"] == "single_plane"
     assert by_name["paper"]["time_to_contact_frames"] == answer["time_to_contact_frames"]
     assert by_name["straight"]["right"] is False
     assert rows["straight"][2] == "128, 128"
+    assert rows["paper"][4] == f"{1e3 * by_name['paper']['seconds']:.1f} ms"
 
     assert run(capsys, *BRICKS, "-o", tmp_path, "--loops", "1", "--no-truth")[0] == 0
     found, rows = side_by_side_of(tmp_path)

@@ -30,7 +30,7 @@ BEGIN, END = "<!-- figures begin: benchmarks/detector.py --write -->", "<!-- fig
 PICTURE_WORDS = """\
 ![Time against image size and number of points](images/performance.png)
 
-Left: a pair at each size, generated corridor, one thread. Right: the other loops with the cap `fast_points` set to 150 .. 1200."""
+Left: a pair at each size, generated corridor, one thread. Right: the other loops with the cap `fast_points` set to 150 .. 1200. Below: the methods and rivals alone."""
 STEPS = ("frames", "features", "flow", "clusters", "lines", "vote", "contact")
 
 

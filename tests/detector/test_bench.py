@@ -304,6 +304,14 @@ def test_a_chart_without_literal_and_points_is_drawn(figures):
     assert (performance_chart(rivals) != picture).any()
 
 
+AT_THE_LEFT_EDGE = {
+    "image_size": [320, 240],
+    "K": [[300.0, 0.0, 20.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]],
+    "frames": [{"file": "1.png"}, {"file": "2.png"}],
+}
+"""Its principal point is cut off where frames are cut to a narrow shape."""
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -315,14 +323,26 @@ def test_a_chart_without_literal_and_points_is_drawn(figures):
         (["{empty}"], "found 0 images"),
         (["--preset", "nobody"], "allowed are default, paper"),
         (["--size", "64x64", "--params", "{strict}"], "--size 64x64"),
+        (["{torn}"], "poses.json: is not valid JSON"),
+        (["{aside}", "--size", "100x400", "--repeats", "1"], "K: cx_px: found -"),
     ],
 )
 def test_bad_input_is_one_clear_line(capsys, tmp_path, arguments, words):
     (tmp_path / "strict.toml").write_text("min_width_px = 100\n")
+    for folder, known in (
+        ("torn", "{"),
+        ("aside", json.dumps(AT_THE_LEFT_EDGE)),
+    ):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "poses.json").write_text(known)
+        for index in (1, 2):
+            cv2.imwrite(str(tmp_path / folder / f"{index}.png"), np.full((240, 320), 90, np.uint8))
     named = [
         each.format(
             empty=tmp_path / "none",
             strict=tmp_path / "strict.toml",
+            torn=tmp_path / "torn",
+            aside=tmp_path / "aside",
             there=OFFICE / "00184.jpg",
         )
         for each in arguments

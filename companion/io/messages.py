@@ -12,6 +12,8 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import lru_cache
+from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -128,10 +130,23 @@ def unpack(packet: bytes) -> Iterator[Message]:
         if at > len(packet):
             raise PacketError(f"a message of {at - begin} bytes in a packet of {len(packet)}")
         try:
-            fields = json.loads(packet[begin:middle]) if fields_bytes else {}
-        except ValueError as error:
+            fields = _fields_of(kind, packet[begin:middle])
+        except (TypeError, ValueError) as error:
             raise PacketError(f"fields of {kind}: {error}") from error
         yield Message(kind, time_ns, seq, fields, packet[middle:at])
+
+
+def _fields_of(kind: Kind, text: bytes) -> Mapping[str, Any]:
+    if kind is Kind.MAVLINK:
+        return _shared_fields(text)
+    fields: dict[str, Any] = json.loads(text) if text else {}
+    return fields
+
+
+@lru_cache(maxsize=64)
+def _shared_fields(text: bytes) -> Mapping[str, Any]:
+    """Return the fields of what comes hundreds of times a second and is one of a few (link and direction); thousands may wait."""
+    return MappingProxyType(json.loads(text) if text else {})
 
 
 def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[list[list[Any]], bytes]:

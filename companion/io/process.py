@@ -11,8 +11,8 @@ from companion.config import Config
 from companion.io.messages import MAX_PACKET_BYTES, FromIo, unpack_from_io
 
 _SEND_BUFFER_BYTES: Final = 1 << 20
-_MEMORY: Final = {"MALLOC_MMAP_THRESHOLD_": str(1 << 18), "MALLOC_TRIM_THRESHOLD_": str(1 << 18)}
-"""Blocks from 256 KiB on go back to the system when they are let go of (mallopt(3)). By itself glibc raises these with the largest block that
+_MEMORY: Final = {"MALLOC_MMAP_THRESHOLD_": str(1 << 16), "MALLOC_TRIM_THRESHOLD_": str(1 << 17)}
+"""Blocks from 64 KiB on, which frames and chunks are, go back to the system when they are let go of (mallopt(3)). By itself glibc raises these with the largest block that
 it has seen, and the process then keeps what a full file or a slow disk once took."""
 
 

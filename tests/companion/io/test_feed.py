@@ -83,6 +83,18 @@ def test_a_flood_is_bounded_and_the_newest_win():
     assert feed.dropped == {"mavlink": 1000}
 
 
+def test_what_waits_by_thousands_shares_its_fields():
+    feed = Feed()
+    feed.want(everything())
+    for n in range(30):
+        feed.mavlink(n % 2, "in", bytes(20), n)
+    found = [m for m in drain(feed) if m.kind is Kind.MAVLINK]
+    assert [dict(m.fields) for m in found] == [{"link": n % 2, "direction": "in"} for n in range(30)]
+    assert len({id(m.fields) for m in found}) == 2
+    with pytest.raises(TypeError):
+        found[0].fields["link"] = 7  # of one is of all
+
+
 def test_packets_hold_many_messages_and_stay_short():
     feed = Feed()
     feed.want(everything())

@@ -1,8 +1,8 @@
 """Does the I/O process grow while it records? Its real process and feed, many times faster than a flight.
 
-    python benchmarks/recorder_memory.py [--minutes M] [--speed N] [--file-mib MIB] [--size WxH] [--trace] [--json FILE]
+    python benchmarks/recorder_memory.py [--minutes M] [--speed N] [--file-mib MIB] [--size WxH] [--folder DIR] [--json FILE]
 
-M minutes of a flight's frames (10 Hz), poses (30 Hz), MAVLink (170 messages/s), setpoints (20 Hz), reports (5 Hz) and log lines go through feed, socket
+M minutes of a flight's frames (10 Hz), poses (30 Hz), MAVLink (170 messages/s), setpoints (20 Hz), loops (5 Hz), status and log lines go through feed, socket
 and shared memory into the recorder, N times as fast as they would come. Every minute of the flight the kernel is asked what the process
 has resident and how much of it is anonymous memory (heap); growth is of the last against the sixth, as in `soak.py`. What is due by the
 real clock (sizes of files every second, the disk every two) is not faster, so files overshoot their size N-fold more.
@@ -27,7 +27,7 @@ from companion.config import Config
 from companion.frames.source import Frame
 from companion.guidance.observation import Pose
 from companion.io.feed import Feed
-from companion.io.messages import Request, Wanted, Wants
+from companion.io.messages import Answer, LogLine, Request, Wanted, Wants
 from companion.io.process import IoProcess
 from companion.io.sinks import RECORDER
 from companion.recorder.sink import wants_of
@@ -118,8 +118,6 @@ class Service:
             self._take()
 
     def _take(self) -> None:
-        from companion.io.messages import Answer, LogLine
-
         match self.process.receive():
             case None:
                 raise SystemExit("the I/O process has ended")

@@ -40,11 +40,6 @@ class PackedIndex:
         """Yield what writes all records, as one."""
         yield _Packed(self._packed)
 
-    @property
-    def size_bytes(self) -> int:
-        """What it takes."""
-        return len(self._packed)
-
 
 class _Packed:
     def __init__(self, data: bytearray) -> None:
@@ -54,8 +49,6 @@ class _Packed:
         stream.write(self._data)
 
 
-def pack_index_of(writer: Writer) -> PackedIndex:
-    """Have a writer that has written no chunk yet keep its index packed; return it."""
-    index = PackedIndex()
-    setattr(writer, _ATTRIBUTE, index)
-    return index
+def pack_index_of(writer: Writer) -> None:
+    """Have a writer that has written no chunk yet keep its index packed."""
+    setattr(writer, _ATTRIBUTE, PackedIndex())

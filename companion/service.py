@@ -61,6 +61,7 @@ from companion.status.server import Command, StatusServer
 from companion.status.snapshot import Section, Snapshots
 from companion.status.unix_socket import socket_path
 from companion.systemd import ServiceNotifier
+from companion.vision.pipeline import VOID_PIPELINE
 from companion.vision.supervisor import VisionSupervisor
 
 _HEALTH_PERIOD_NS: Final = 100_000_000
@@ -123,7 +124,9 @@ class Service:
         runtime_folder: Path | None = None,
         feed: Feed | None = None,
         log_tap: LogTap | None = None,
+        pipeline: str = VOID_PIPELINE,
     ) -> None:
+        self._pipeline = pipeline
         self._is_listened_to = feed is not None or bool(sinks_of(config))
         self._feed = feed if feed is not None else Feed()
         if feed is None:
@@ -217,6 +220,7 @@ class Service:
                 clock=clock,
                 on_report=on_report,
                 log=log,
+                pipeline=self._pipeline,
                 on_details=lambda details: self._feed.details(details.fields, details.data, clock.now_ns()),
                 wants_details=lambda: self._feed.wants(Kind.DETAILS),
             )

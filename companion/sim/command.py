@@ -45,7 +45,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=get_args(Method),
         default=default.method,
-        help="parallax: the service with the void map; paper: with the published method; off: no service, the planner speaks to the autopilot",
+        help="parallax: the service with the void map; paper: with the published method; straight, flow_balance, line_vp: rivals for scale in its place (simulated time only); off: no service, the planner speaks to the autopilot",
     )
     add_flight_arguments(parser)
     parser.add_argument("--video", type=Path, metavar="OUT.mp4", help="write an annotated video")

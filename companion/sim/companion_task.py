@@ -24,6 +24,7 @@ from companion.log import Log
 from companion.mavlink.endpoint import Endpoint
 from companion.service import Service
 from companion.sim.companion_process import CompanionProcessError, Event
+from companion.vision.pipeline import VOID_PIPELINE
 
 
 class CompanionTask:
@@ -41,6 +42,8 @@ class CompanionTask:
         Called with every event of its log, as it comes.
     feed
         Told what happens in it.
+    pipeline
+        What its worker runs (``companion.vision.pipeline.load_factory``).
 
     Raises
     ------
@@ -56,6 +59,7 @@ class CompanionTask:
         open_frames: Callable[[], FrameSource],
         on_event: Callable[[Event], None] | None = None,
         feed: Feed | None = None,
+        pipeline: str = VOID_PIPELINE,
     ) -> None:
         links = {"planner": "udpin:127.0.0.1:0", "autopilot": "udpin:127.0.0.1:0"}
         merged = {**tables, "link": {**links, **tables.get("link", {})}}
@@ -73,6 +77,7 @@ class CompanionTask:
             log=_event_log(config.log.level, self._take),
             open_frames=open_frames,
             feed=feed,
+            pipeline=pipeline,
         )
         self._task: asyncio.Task[None] | None = None
 

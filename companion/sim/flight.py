@@ -16,7 +16,7 @@ import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
@@ -30,7 +30,9 @@ from companion.sim.frame_faults import FrameFaults
 from companion.sim.image_effects import ImageEffects
 from companion.sim.vehicle import Vector3
 
-Method = Literal["paper", "parallax", "off"]
+Rival = Literal["straight", "flow_balance", "line_vp"]
+Method = Literal["paper", "parallax", Rival, "off"]
+RIVALS: Final = get_args(Rival)
 PlannerKind = Literal["waypoints", "mavsdk"]
 """``waypoints``: ``companion.sim.planner``. ``mavsdk``: an unmodified mavsdk client, in real time only."""
 
@@ -55,7 +57,8 @@ class FlightSpec:
     seed
         Of the random world, the camera's noise and the estimate's errors.
     method
-        ``paper``: the service with the detector's default preset. ``parallax``: the service with the void map. ``off``: no service.
+        ``paper``: the service with the detector's default preset. ``parallax``: the service with the void map. ``straight``, ``flow_balance``, ``line_vp``:
+        rivals for scale in place of the paper's detector (``companion.sim.rivals``), in simulated time only. ``off``: no service.
     planner
         Who streams setpoints.
     realtime
@@ -109,6 +112,10 @@ class FlightSpec:
         if self.planner == "mavsdk" and not self.realtime:
             raise FlightError(
                 "the mavsdk planner keeps its own time: it flies in real time only (--realtime)"
+            )
+        if self.realtime and self.method in RIVALS:
+            raise FlightError(
+                f"{self.method} is a rival for scale: it flies in simulated time only (no --realtime)"
             )
         limits: dict[str, tuple[float, float]] = {
             "seed": (0, 2**32 - 1),

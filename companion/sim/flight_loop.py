@@ -11,7 +11,7 @@ from companion.clock import Clock
 from companion.sim.autopilot import FakeAutopilot
 from companion.sim.camera_feed import Renderer
 from companion.sim.estimate_errors import ErringEstimate
-from companion.sim.flight import FlightError, FlightSpec
+from companion.sim.flight import RIVALS, FlightError, FlightSpec
 from companion.sim.flight_place import Place
 from companion.sim.flight_record import FlightRecorder
 from companion.sim.flight_referee import Outcome, Referee
@@ -42,7 +42,7 @@ def autopilot_of(spec: FlightSpec, place: Place, clock: Clock) -> FakeAutopilot:
 def service_tables(spec: FlightSpec, autopilot: Address) -> dict[str, dict[str, Any]]:
     """Return the service's configuration for a flight with it, its frame source left out."""
     tables: dict[str, dict[str, Any]] = {
-        "detector": {"method": spec.method},
+        "detector": {"method": "paper" if spec.method in RIVALS else spec.method},
         "source": {"min_rate_hz": min(2.0, 0.4 * spec.frame_rate_hz)},
         "camera": {"hfov_deg": spec.hfov_deg},
         "link": {"autopilot": "udpout:{}:{}".format(*autopilot)},

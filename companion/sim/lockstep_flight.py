@@ -10,7 +10,7 @@ from companion.recorder.in_process import InProcessRecorder
 from companion.run_statistics import percentiles
 from companion.sim.companion_process import Event
 from companion.sim.companion_task import CompanionTask
-from companion.sim.flight import FlightSpec, FlownFlight
+from companion.sim.flight import RIVALS, FlightSpec, FlownFlight
 from companion.sim.flight_loop import (
     Address,
     autopilot_of,
@@ -26,6 +26,7 @@ from companion.sim.flight_record import FlightRecorder
 from companion.sim.lockstep import LockstepLoop, run_lockstep
 from companion.sim.planner import Planner
 from companion.sim.stepped_camera import SteppedCamera
+from companion.vision.pipeline import VOID_PIPELINE
 
 _WORKER_START_S = 1.0
 """Simulated: it starts in no time."""
@@ -79,6 +80,9 @@ async def _fly(
                     open_frames=lambda: camera,
                     on_event=on_event,
                     feed=None if in_process is None else in_process.feed,
+                    pipeline=f"companion.sim.rivals:{spec.method}"
+                    if spec.method in RIVALS
+                    else VOID_PIPELINE,
                 )
             )
             if in_process is not None:

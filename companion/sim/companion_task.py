@@ -26,6 +26,8 @@ from companion.service import Service
 from companion.sim.companion_process import CompanionProcessError, Event
 from companion.vision.pipeline import VOID_PIPELINE
 
+_MOST_OF_A_COMPLAINT = 600
+
 
 class CompanionTask:
     """One run of the service as a task; ``async with`` starts it and ends it.
@@ -123,7 +125,21 @@ class CompanionTask:
                     self._news.clear()
                     await self._news.wait()
         except TimeoutError:
-            raise CompanionProcessError(f"the service did not say '{name}' within {timeout_s:g} s") from None
+            raise CompanionProcessError(
+                f"the service did not say '{name}' within {timeout_s:g} s{self._last_complaint()}"
+            ) from None
+
+    def _last_complaint(self) -> str:
+        """Return the last thing that it warned of, to stand behind a message; empty where there was none."""
+        for event in reversed(self.events):
+            if event.get("level") in ("warning", "error"):
+                said = ", ".join(
+                    f"{key}: {value}"
+                    for key, value in event.items()
+                    if key not in ("event", "level", "traceback")
+                )
+                return f"; it said {event.get('event')}: {said}"[:_MOST_OF_A_COMPLAINT]
+        return ""
 
     async def stop(self) -> None:
         """End the service.

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from companion.cli import main
 from companion.config import CameraConfig, Config, DetectorConfig
+from companion.errors import CompanionError
 from companion.frames.source import Frame
 from companion.guidance.observation import Pose
 from companion.sim import rivals
@@ -91,3 +92,10 @@ def test_a_rival_flies_through_the_real_service():
     assert (result.method, result.collisions) == ("straight", 0)
     assert set(result.answers) <= {"lowest_flow", "none"}
     assert result.answers["lowest_flow"] >= 5
+
+
+def test_a_worker_that_does_not_come_up_is_named_where_the_flight_ends(monkeypatch):
+    broken = "tests.companion.vision.stub_pipelines:broken"
+    monkeypatch.setattr("companion.sim.lockstep_flight.VOID_PIPELINE", broken)
+    with pytest.raises(CompanionError, match="a fault of the program"):
+        fly(FlightSpec(method="paper", width_px=160, height_px=120, time_limit_s=3.0), ROOM)

@@ -221,6 +221,11 @@ class Episode:
         """Remember that a blind step was taken at this heading."""
         self._bootstrapped_rad.append(look_rad)
 
+    def forget_last_bootstrap(self) -> None:
+        """Take back the last blind step: it was not made."""
+        if self._bootstrapped_rad:
+            self._bootstrapped_rad.pop()
+
     def was_bootstrapped(self, look_rad: float, within_rad: float) -> bool:
         """Whether a blind step was taken close to this heading in this episode."""
         return any(abs(wrap_rad(b - look_rad)) < within_rad for b in self._bootstrapped_rad)

@@ -19,6 +19,8 @@ _CLEARLY_M = 0.7
 _DEAD_AHEAD_RAD = math.radians(5.0)
 _ALIGN_SPARE_RAD = math.radians(30.0)
 _SAME_DIRECTION_RAD = math.radians(15.0)
+_BLIND = "camera axis"
+_PROBE_MADE_SHARE = 0.5
 
 Place = tuple[float, float]
 """North and east in local NED, m."""
@@ -49,6 +51,7 @@ class Plan:
         self.turn_target_rad = 0.0
         self.probed = ""
         self.probe_target: Place = (0.0, 0.0)
+        self._probe_from: Place = (0.0, 0.0)
         self.probe_yaw_rad = 0.0
         self.probe_down_m = 0.0
 
@@ -119,16 +122,24 @@ class Plan:
         choice = self.probe_choice(pose, look, now_ns)
         self.probe_yaw_rad = heading_rad(pose.q_ned_from_body)
         self.probe_down_m = pose.down_m
+        self._probe_from = (pose.north_m, pose.east_m)
         self._evidence.take_answers_after(now_ns)
         if choice is None:
             self.probed = ""
             self.probe_target = (pose.north_m, pose.east_m)
             return
         self.probed, self.probe_target = choice
-        if self.probed == "camera axis":
+        if self.probed == _BLIND:
             if self.episode is None:
                 self.episode = Episode(pose.north_m, pose.east_m)
             self.episode.bootstrap(look)
+
+    def cut_probe_short(self, pose: Pose) -> None:
+        """Take back a blind step of which less than half was made when something else began: it may be made again."""
+        moved_m = math.dist(self._probe_from, (pose.north_m, pose.east_m))
+        least_m = _PROBE_MADE_SHARE * self._config.probe_step_m
+        if self.probed == _BLIND and self.episode is not None and moved_m < least_m:
+            self.episode.forget_last_bootstrap()
 
     def probe_choice(self, pose: Pose, look_rad: float, now_ns: int) -> tuple[str, Place] | None:
         """Return why and where a probe would step, or None where there is no way for it."""
@@ -154,7 +165,7 @@ class Plan:
         half_step = math.radians(config.turn_step_deg) / 2
         used = self.episode is not None and self.episode.was_bootstrapped(look_rad, half_step)
         if config.bootstrap_probe and not blocked and not used:
-            return "camera axis", along(look_rad)
+            return _BLIND, along(look_rad)
         return None
 
     def _goal_side(self, pose: Pose, look_rad: float) -> int:

@@ -253,6 +253,7 @@ class Switch:
         standing.reason_ns = now_ns
         if state is previous:
             return  # HOLD with another reason: its anchor and its time stay
+        lasted_s = standing.for_s(now_ns)
         standing.state = state
         standing.entered_ns = now_ns
         if state not in HELD_STATES:
@@ -264,6 +265,9 @@ class Switch:
             plan.set_anchor(pose)
         elif state is State.HOLD:
             plan.anchor_yaw_rad = heading_rad(pose.q_ned_from_body)
+        # One that had its time counts as made whatever the pose says: an estimate may stand still while the vehicle does not.
+        if previous is State.PROBE and lasted_s < self._config.probe_timeout_s:
+            plan.cut_probe_short(pose)
         if state is State.STEER:
             plan.steer_start = (pose.north_m, pose.east_m)
         if state is State.TURN or (state is State.STEER and reason != GAP_SEEN):

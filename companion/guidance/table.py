@@ -278,7 +278,8 @@ class Table:
             s.answer is not None or s.gap is not None
         ):  # an answer newer than the probe, see Plan.begin_probe()
             state, reason = self.choose(s)
-            if state is not State.HOLD:
+            # A way that was not looked through is held before as soon as the vehicle rests: the step that shows its sides is made first.
+            if state is not State.HOLD and not self._waits_to_look(state, s):
                 return state, reason
         if self._standing.for_s(s.now_ns) < self._config.probe_timeout_s:
             return None

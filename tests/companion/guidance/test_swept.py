@@ -104,3 +104,43 @@ def test_at_rest_a_way_not_looked_through_is_held_for_and_then_stepped_back_from
     assert bench.state is State.PROBE
     assert isinstance(decision, Rewrite)
     assert decision.x <= -0.35
+
+
+def blind_step(bench: Bench) -> None:
+    """Have no parallax until a step along the camera's axis is begun."""
+    for _ in range(100):
+        bench.report("none", reason="no_motion")
+        bench.ask(setpoint(5.0, 0.0))
+        if bench.state is State.PROBE:
+            assert bench.switch._plan.probed == "camera axis"
+            return
+    raise AssertionError("no blind step was made")
+
+
+def test_a_blind_step_that_a_glimpse_cut_short_is_made_again():
+    bench = Bench()
+    bench.switch.on_pose(bench.pose(), 0.0)
+    blind_step(bench)
+    bench.n = 0.02
+    ranges = {math.radians(a): 6.0 for a in range(-30, 31, 3)}
+    bench.void(0.0, ranges, swept_m=reaching({}, 0.6))
+    bench.ask(setpoint(5.0, 0.0))
+    assert bench.state is State.FOLLOW
+    bench.void(0.0, ranges, swept_m=reaching({}, 0.1))
+    bench.ask(setpoint(5.0, 0.0))
+    assert (bench.state, bench.switch.reason) == (State.HOLD, "way not looked through")
+    blind_step(bench)
+
+
+def test_a_probe_goes_on_where_the_way_it_shows_was_not_looked_through():
+    bench = Bench()
+    bench.switch.on_pose(bench.pose(), 0.0)
+    blind_step(bench)
+    bench.n, bench.speed = 0.1, 0.3
+    ranges = {math.radians(a): 6.0 for a in range(-30, 31, 3)}
+    bench.void(0.0, ranges, swept_m=reaching({}, 0.1))
+    bench.ask(setpoint(5.0, 0.0))
+    assert bench.state is State.PROBE
+    bench.void(0.0, ranges, swept_m=reaching({}, 1.0))
+    bench.ask(setpoint(5.0, 0.0))
+    assert bench.state is State.FOLLOW

@@ -1,4 +1,4 @@
-"""The worker's pipeline: the detector's answers as reports. The only module that imports ``detector``.
+"""The worker's pipeline: the detector's answers as reports. With ``parallax_child`` the only module of the service that imports ``detector``.
 
 From a frame and the vehicle's pose to the paper's block L2I: the answered pixel as a ray in body FRD, its
 range in metres, and the free distance along level azimuths across the field of view.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, Self
+from typing import Self
 
 from companion.children.process import ChildProcess
 from companion.vision.messages import (
@@ -12,10 +12,6 @@ from companion.vision.messages import (
     pack_to_worker,
     unpack_from_worker,
 )
-
-_MEMORY: Final = {"MALLOC_MMAP_THRESHOLD_": str(1 << 25), "MALLOC_TRIM_THRESHOLD_": str(1 << 28)}
-"""Pictures are kept by malloc when they are let go of (mallopt(3); 32 MiB is the most it takes). By itself glibc gives each back to the system, and the
-next one of the same size is paid for page by page: a fifth of a pair's time."""
 
 
 class WorkerProcess(ChildProcess):
@@ -30,7 +26,7 @@ class WorkerProcess(ChildProcess):
         OSError
             When there are too many processes or open files, or too little memory.
         """
-        return cls.start_module("companion.vision.child_process", threads=threads, environment=_MEMORY)
+        return cls.start_module("companion.vision.child_process", threads=threads)
 
     def send(self, message: ToWorker, fd: int | None = None) -> None:
         """Send a message, with a file descriptor where given. Never blocks.

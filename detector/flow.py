@@ -52,6 +52,11 @@ class Tracks:
         if len(self.start_px) != len(self.end_px):
             raise ValueError(f"expected as many starts as ends, got {len(self.start_px)}, {len(self.end_px)}")
 
+    @classmethod
+    def none(cls) -> Tracks:
+        """Return no vectors."""
+        return cls(np.zeros((0, 2)), np.zeros((0, 2)))
+
     def __len__(self) -> int:
         return len(self.start_px)
 

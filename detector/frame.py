@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from detector.camera_model import CameraModel
 from detector.frame_quality import FrameFault, frame_fault
 from detector.params import DetectorParams
+from detector.results import NoDetectionReason
 
 
 @dataclass(slots=True)
@@ -55,3 +57,35 @@ def prepare(image: NDArray[np.uint8], params: DetectorParams) -> Frame:
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"expected (H, W) uint8, got {image.shape} {image.dtype}")
     return Frame(image, frame_fault(image, params))
+
+
+def pair_fault(earlier: Frame, later: Frame, camera: CameraModel | None) -> FrameFault | None:
+    """Return why two frames cannot be used as a pair; None where they can.
+
+    Parameters
+    ----------
+    earlier, later
+        The frames.
+    camera
+        Of both, if known.
+    """
+    height_px, width_px = later.image.shape
+    if earlier.image.shape != later.image.shape:
+        return FrameFault(
+            NoDetectionReason.WRONG_SIZE,
+            f"frames of {_size(earlier)} and {_size(later)}: they must be of one size",
+        )
+    if camera is not None and (width_px, height_px) != (camera.width_px, camera.height_px):
+        return FrameFault(
+            NoDetectionReason.WRONG_SIZE,
+            f"frames of {_size(later)}, the camera model is for {camera.width_px} x {camera.height_px}",
+        )
+    for name, frame in (("earlier", earlier), ("later", later)):
+        if frame.fault is not None:
+            return FrameFault(frame.fault.reason, f"{name} frame: {frame.fault.detail}")
+    return None
+
+
+def _size(frame: Frame) -> str:
+    height_px, width_px = frame.image.shape
+    return f"{width_px} x {height_px} px"

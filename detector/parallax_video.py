@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from detector.camera_model import CameraModel
 from detector.drawing.frame import FrameCanvas
 from detector.drawing.void_map import draw_map_from_above, draw_map_over
+from detector.flow import Tracks
 from detector.observer import CameraPose
 from detector.overlay import headline, legible_zoom
 from detector.parallax.stream import ParallaxObservation, ParallaxObserver
-from detector.video import Answered, FrameAnswerer, no_tracks
+from detector.video import Answered, FrameAnswerer
 
 _INSET_SHARE = 0.42
 
@@ -37,7 +38,7 @@ def by_parallax(camera: CameraModel | None) -> FrameAnswerer:
             def paint(picture: NDArray[np.uint8], notes: tuple[str, ...]) -> NDArray[np.uint8]:
                 return draw_reading(picture, seen, camera, pose.world_from_camera, notes=notes)
 
-        return Answered.of(seen, no_tracks(), paint)
+        return Answered.of(seen, Tracks.none(), paint)
 
     return answer
 

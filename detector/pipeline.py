@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from detector import clusters, expansion, fast_clusters, flow, lines, outliers, vanishing_point, vote
 from detector.camera_model import CameraModel
 from detector.flow import Tracks
-from detector.frame import Frame, prepare
+from detector.frame import Frame, pair_fault, prepare
 from detector.params import DetectorParams, scaled_px
 from detector.results import (
     Detection,
@@ -190,10 +190,10 @@ class VoidDetector:
         with notes.step("frames"):
             earlier = self._frame("earlier", earlier)
             later = self._frame("later", later)
-        tracks = Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
+        tracks = Tracks.none()
         focus: NDArray[np.float64] | None = None
         try:
-            self._check_frames(earlier, later, camera)
+            _check_frames(earlier, later, camera)
             points = self._features(earlier, later, notes)
             raw, tracks = self._flow(earlier.image, later.image, points, camera, later_from_earlier, notes)
             self._carry(later, raw, notes)
@@ -218,22 +218,6 @@ class VoidDetector:
             return self.prepare(image)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
-
-    def _check_frames(self, earlier: Frame, later: Frame, camera: CameraModel | None) -> None:
-        shape = later.image.shape
-        if earlier.image.shape != shape:
-            raise _Stop(
-                NoDetectionReason.WRONG_SIZE,
-                f"frames of {_size(earlier)} and {_size(later)}: they must be of one size",
-            )
-        if camera is not None and shape != (camera.height_px, camera.width_px):
-            raise _Stop(
-                NoDetectionReason.WRONG_SIZE,
-                f"frames of {_size(later)}, the camera model is for {camera.width_px} x {camera.height_px}",
-            )
-        for name, frame in (("earlier", earlier), ("later", later)):
-            if frame.fault is not None:
-                raise _Stop(frame.fault.reason, f"{name} frame: {frame.fault.detail}")
 
     def _features(self, earlier: Frame, later: Frame, notes: _Notes) -> NDArray[np.float32]:
         """Return where the flow starts; stop where either frame holds too few key points."""
@@ -579,6 +563,7 @@ class VoidDetector:
         return expansion.time_to_contact_along(start, end, focus, towards, gate_px)
 
 
-def _size(frame: Frame) -> str:
-    height, width = frame.image.shape
-    return f"{width} x {height} px"
+def _check_frames(earlier: Frame, later: Frame, camera: CameraModel | None) -> None:
+    fault = pair_fault(earlier, later, camera)
+    if fault is not None:
+        raise _Stop(fault.reason, fault.detail)

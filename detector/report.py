@@ -137,7 +137,7 @@ def examine(pair: Pair, params: DetectorParams) -> Steps:
     earlier, later = detector.prepare(pair.earlier), detector.prepare(pair.later)
     result = detector.detect(earlier, later, camera=pair.camera, later_from_earlier=pair.later_from_earlier)
     found = result.detection.diagnostics
-    tracks, came_back = Tracks(np.zeros((0, 2)), np.zeros((0, 2))), np.zeros(0, np.bool_)
+    tracks, came_back = Tracks.none(), np.zeros(0, np.bool_)
     if found.n_tracks and earlier.seeds_px is not None:
         tracks, came_back = _followed(pair, earlier.seeds_px, params)
     long_enough, kept = came_back.copy(), came_back.copy()

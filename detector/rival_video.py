@@ -9,16 +9,17 @@ from numpy.typing import NDArray
 
 from detector.camera_model import CameraModel
 from detector.evaluation.methods import Method, PairInput
+from detector.flow import Tracks
 from detector.frame import Frame
 from detector.observer import CameraPose, ObserverParams, VoidObserver
 from detector.params import DetectorParams
 from detector.pipeline import PairResult
 from detector.results import Diagnostics, NoDetection, NoDetectionReason
-from detector.video import Answered, FrameAnswerer, no_tracks
+from detector.video import Answered, FrameAnswerer
 
 _LEFT_TO_THE_RIVAL: Final = PairResult(
     NoDetection(NoDetectionReason.NOTHING_KNOWN, "the rival answers, not the observer", Diagnostics()),
-    no_tracks(),
+    Tracks.none(),
     None,
 )
 """What the observer is told of a pair, and nobody else: a rival's answers are of kinds that a detection has not."""
@@ -45,9 +46,9 @@ def by_rival(method: Method, params: DetectorParams, camera: CameraModel | None)
         seen = observer.observe(image, time_ns, pose)
         pair = taker.taken()
         if pair is None:  # the observer says why there was none
-            return Answered.of(seen, no_tracks())
+            return Answered.of(seen, Tracks.none())
         said = method.answer(pair)
-        return Answered(said, None, seen.time_ns, seen.earlier_time_ns, seen.baseline_m, no_tracks())
+        return Answered(said, None, seen.time_ns, seen.earlier_time_ns, seen.baseline_m, Tracks.none())
 
     return answer
 

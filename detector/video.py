@@ -90,7 +90,7 @@ def by_observer(params: DetectorParams, camera: CameraModel | None) -> FrameAnsw
     observer = VoidObserver(params, camera, detector=recorder)
 
     def answer(image: NDArray[np.uint8], time_ns: int, pose: CameraPose | None) -> Answered:
-        recorder.tracks = no_tracks()
+        recorder.tracks = Tracks.none()
         observation = observer.observe(image, time_ns, pose)
         return Answered.of(observation, recorder.tracks)
 
@@ -124,7 +124,7 @@ def by_fixed_step(params: DetectorParams, camera: CameraModel | None, step: int)
         if earlier is None:
             words = f"frame {len(kept)} of the first {step}"
             nothing = NoDetection(NoDetectionReason.NO_EARLIER_FRAME, words, Diagnostics())
-            return Answered.of(Observation(nothing, time_ns), no_tracks())
+            return Answered.of(Observation(nothing, time_ns), Tracks.none())
         frame, earlier_ns, earlier_pose = earlier
         rotation = translation = baseline_m = None
         if pose is not None and earlier_pose is not None:
@@ -146,7 +146,7 @@ class _Recorder:
 
     def __init__(self, detector: VoidDetector) -> None:
         self._detector = detector
-        self.tracks = no_tracks()
+        self.tracks = Tracks.none()
 
     def detect(
         self,
@@ -169,11 +169,6 @@ class _Recorder:
 
     def reset(self) -> None:
         self._detector.reset()
-
-
-def no_tracks() -> Tracks:
-    """Return no flow vectors."""
-    return Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
 
 
 def annotated(image: NDArray[np.uint8], answered: Answered, number: int, time_s: float) -> NDArray[np.uint8]:

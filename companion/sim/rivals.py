@@ -18,7 +18,7 @@ from companion.vision.child import FrameObserver, VoidPipeline
 from detector.camera_model import CameraModel
 from detector.evaluation.methods import METHODS, Answer, Method, PairInput
 from detector.flow import Tracks
-from detector.frame import Frame
+from detector.frame import Frame, pair_fault
 from detector.observer import ObserverParams, VoidObserver
 from detector.params import DetectorParams
 from detector.pipeline import PairResult
@@ -94,10 +94,9 @@ class RivalDetector:
         translation_earlier: NDArray[np.float64] | None = None,
     ) -> PairResult:
         """Return the rival's answer to a pair, without tracks: it has none."""
-        for name, frame in (("earlier", earlier), ("later", later)):
-            if frame.fault is not None:
-                detail = f"{name} frame: {frame.fault.detail}"
-                return _result(NoDetection(frame.fault.reason, detail, Diagnostics()))
+        fault = pair_fault(earlier, later, camera)
+        if fault is not None:
+            return _result(NoDetection(fault.reason, fault.detail, Diagnostics()))
         answer = self._method.answer(
             PairInput(earlier.image, later.image, camera, later_from_earlier, translation_earlier)
         )
@@ -116,5 +115,4 @@ def _detection(answer: Answer, kind: DirectionKind) -> Detection:
 
 
 def _result(detection: Detection) -> PairResult:
-    none = np.empty((0, 2))
-    return PairResult(detection, Tracks(none, none), None)
+    return PairResult(detection, Tracks.none(), None)

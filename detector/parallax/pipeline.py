@@ -12,14 +12,13 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from detector.camera_model import CameraModel
 from detector.flow import Tracks
-from detector.frame import Frame, prepare
+from detector.frame import Frame, pair_fault, prepare
 from detector.parallax.decision import Decision, decide
 from detector.parallax.depth_sweep import sweep_depth
 from detector.parallax.egomotion import (
@@ -38,8 +37,6 @@ from detector.parallax.samples import RangedSamples
 from detector.parallax.void_map import VoidMapParams
 from detector.params import DetectorParams
 from detector.results import Detection, Diagnostics, MotionEstimate, NoDetection, NoDetectionReason
-
-_NO_TRACKS: Final = Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,10 +190,9 @@ class ParallaxDetector:
             intrinsics = Intrinsics(
                 CameraModel.from_hfov(width_px, height_px, self.params.assumed_hfov_deg), "assumed"
             )
-        fault = _unusable(first, second, intrinsics.camera)
+        fault = pair_fault(first, second, intrinsics.camera)
         if fault is not None:
-            reason, detail = fault
-            return _nothing(reason, detail, Diagnostics(seconds=seconds))
+            return _nothing(fault.reason, fault.detail, Diagnostics(seconds=seconds))
         clock.step("frames")
         camera = intrinsics.camera
         direction = None
@@ -327,22 +323,6 @@ class _Clock:
         self._last_s = now_s
 
 
-def _unusable(earlier: Frame, later: Frame, camera: CameraModel) -> tuple[NoDetectionReason, str] | None:
-    shape = later.image.shape
-    if earlier.image.shape != shape:
-        return NoDetectionReason.WRONG_SIZE, (
-            f"frames of {_size(earlier)} and {_size(later)}: they must be of one size"
-        )
-    if shape != (camera.height_px, camera.width_px):
-        return NoDetectionReason.WRONG_SIZE, (
-            f"frames of {_size(later)}, the camera model is for {camera.width_px} x {camera.height_px}"
-        )
-    for name, frame in (("earlier", earlier), ("later", later)):
-        if frame.fault is not None:
-            return frame.fault.reason, f"{name} frame: {frame.fault.detail}"
-    return None
-
-
 def _motion_estimate(
     geometry: PairGeometry, intrinsics: Intrinsics, field: FlowField, left_rad: float
 ) -> MotionEstimate:
@@ -378,12 +358,7 @@ def _tracks(field: FlowField, motion: Egomotion) -> Tracks:
 def _nothing(
     reason: NoDetectionReason, detail: str, diagnostics: Diagnostics, field: FlowField | None = None
 ) -> ParallaxResult:
-    return ParallaxResult(NoDetection(reason, detail, diagnostics), _NO_TRACKS, None, field=field)
-
-
-def _size(frame: Frame) -> str:
-    height_px, width_px = frame.image.shape
-    return f"{width_px} x {height_px}"
+    return ParallaxResult(NoDetection(reason, detail, diagnostics), Tracks.none(), None, field=field)
 
 
 def _floats(vector: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -33,7 +33,6 @@ from detector.params import DetectorParams
 from detector.pipeline import PairResult
 from detector.results import Detection, Direction, DirectionKind, NoDetection, NoDetectionReason
 
-_NO_TRACKS: Final = Tracks(np.zeros((0, 2)), np.zeros((0, 2)))
 _CONTACT_GATE_RAD: Final = math.radians(5.0)
 _SAYS_NOTHING: Final = (NoDetectionReason.NO_MOTION, NoDetectionReason.NO_EARLIER_FRAME)
 """Without parallax there is nothing to see; what was seen before stays so."""
@@ -260,7 +259,7 @@ class _Pairs:
         )
         if camera is None and self.result.geometry is not None and self.result.field is not None:
             self._uncalibrated.learn(self.result.field)
-        return PairResult(self.result.detection, _NO_TRACKS, self.result.focus_px)
+        return PairResult(self.result.detection, Tracks.none(), self.result.focus_px)
 
 
 def _seen_at(

@@ -25,7 +25,6 @@ from detector.video import (
     by_observer,
     fitted,
     natural_key,
-    no_tracks,
     side_by_side,
 )
 
@@ -175,7 +174,7 @@ def test_a_rivals_picture_has_its_mark_or_its_reason():
     grey = np.full((240, 480), 120, np.uint8)
 
     def shown(answer):
-        return annotated(grey, Answered(answer, None, 0, None, None, no_tracks()), 0, 0.0)
+        return annotated(grey, Answered(answer, None, 0, None, None, Tracks.none()), 0, 0.0)
 
     left, right, silent = (
         shown(Answer("flow_balance", (100.0, 150.0))),
@@ -194,7 +193,7 @@ def test_a_rivals_picture_has_its_mark_or_its_reason():
 def test_panels_stand_side_by_side_each_with_its_name():
     grey = np.full((240, 480), 120, np.uint8)
     answered = {
-        name: Answered(Answer(name, (100.0, 150.0)), None, 0, None, None, no_tracks())
+        name: Answered(Answer(name, (100.0, 150.0)), None, 0, None, None, Tracks.none())
         for name in ("straight", "flow_balance", "line_vp", "fourth")
     }
     alone = annotated(grey, answered["straight"], 1, 0.1)

@@ -54,6 +54,16 @@ class Samples:
         self.seconds[series].append(seconds)
         self.kinds[series][kind] = self.kinds[series].get(kind, 0) + 1
 
+    def note_detection(self, series: str, detection: Detection, seconds: float, prepared_s: float) -> bool:
+        """Add one sample of a detector and its steps, of which preparing the frames took ``prepared_s``; return whether it answered."""
+        answered = isinstance(detection, Direction | SinglePlane)
+        self.note(series, seconds if answered else None, _kind_of(detection))
+        if answered:
+            steps = dict(detection.diagnostics.seconds)
+            steps["frames"] = steps.get("frames", 0.0) + prepared_s
+            self.steps[series].append(steps)
+        return answered
+
 
 class Paths:
     """The series on one stream. Pair i is (frame i, frame i + 1)."""
@@ -164,12 +174,7 @@ class Paths:
             self._earlier = later
             if earlier.seeds_px is not None:
                 self._points[pair] = earlier.seeds_px
-        answered = isinstance(detection, Direction | SinglePlane)
-        samples.note(series, end - begin if answered else None, _kind_of(detection))
-        if answered:
-            steps = dict(detection.diagnostics.seconds)
-            steps["frames"] = steps.get("frames", 0.0) + prepared - begin
-            samples.steps[series].append(steps)
+        if samples.note_detection(series, detection, end - begin, prepared - begin):
             samples.points[series].append(0 if earlier.seeds_px is None else len(earlier.seeds_px))
 
     def _parallax_loop(
@@ -195,12 +200,7 @@ class Paths:
         ).detection
         end = self._clock()
         self._parallax_earlier[series] = later
-        answered = isinstance(detection, Direction | SinglePlane)
-        samples.note(series, end - begin if answered else None, _kind_of(detection))
-        if answered:
-            steps = dict(detection.diagnostics.seconds)
-            steps["frames"] = steps.get("frames", 0.0) + prepared - begin
-            samples.steps[series].append(steps)
+        samples.note_detection(series, detection, end - begin, prepared - begin)
 
     def _parallax_with_poses(self, pair: int, samples: Samples) -> None:
         camera = self._stream.camera
@@ -213,8 +213,7 @@ class Paths:
             pair,
             samples,
             Intrinsics(camera, "calibration"),
-            later.world_from_camera.T @ earlier.world_from_camera,
-            earlier.world_from_camera.T @ (later.position_m - earlier.position_m),
+            *earlier.motion_to(later),
             later.world_from_camera,
         )
 

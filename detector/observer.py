@@ -68,6 +68,21 @@ class CameraPose:
                 f"expected (3, 3) and (3,), got {np.shape(self.world_from_camera)} and {np.shape(self.position_m)}"
             )
 
+    def motion_to(self, later: CameraPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how the camera moved from here to a later pose, as a detector takes it.
+
+        Returns
+        -------
+        later_from_earlier
+            (3, 3) rotation that takes coordinates of this camera to those of the later one.
+        translation_earlier_m
+            (3,) from this position to the later one, in this camera's axes.
+        """
+        return (
+            later.world_from_camera.T @ self.world_from_camera,
+            self.world_from_camera.T @ (later.position_m - self.position_m),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class ObserverParams:
@@ -384,8 +399,7 @@ class VoidObserver:
             moved_m = pose.position_m - earlier.pose.position_m
             baseline_m = float(np.linalg.norm(moved_m))
             if camera is not None:
-                later_from_earlier = pose.world_from_camera.T @ earlier.pose.world_from_camera
-                translation_earlier = earlier.pose.world_from_camera.T @ moved_m
+                later_from_earlier, translation_earlier = earlier.pose.motion_to(pose)
                 translation_later = pose.world_from_camera.T @ moved_m
         result = self._detector.detect(
             earlier.frame,

@@ -128,11 +128,9 @@ def by_fixed_step(params: DetectorParams, camera: CameraModel | None, step: int)
         frame, earlier_ns, earlier_pose = earlier
         rotation = translation = baseline_m = None
         if pose is not None and earlier_pose is not None:
-            moved_m = pose.position_m - earlier_pose.position_m
-            baseline_m = float(np.linalg.norm(moved_m))
+            baseline_m = float(np.linalg.norm(pose.position_m - earlier_pose.position_m))
             if camera is not None:
-                rotation = pose.world_from_camera.T @ earlier_pose.world_from_camera
-                translation = earlier_pose.world_from_camera.T @ moved_m
+                rotation, translation = earlier_pose.motion_to(pose)
         result = detector.detect(
             frame, later, camera=camera, later_from_earlier=rotation, translation_earlier=translation
         )

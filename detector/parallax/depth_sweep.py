@@ -172,7 +172,7 @@ def _seen_by(
     """Return an image as the reduced camera would have seen it after a turn; NaN where nothing was seen."""
     size = (reduced.width_px, reduced.height_px)
     if not camera.is_distorted and np.array_equal(turn, np.eye(3)):
-        return _resized(image, size).astype(np.float32)
+        return resized(image, size).astype(np.float32)
     # Turned at the double size: at the small one the turn's own smoothing would take texture off one of the two pictures.
     double = (2 * size[0], 2 * size[1])
     if image.shape[1] < double[0]:
@@ -183,7 +183,7 @@ def _seen_by(
     at = np.nan_to_num(source.ray_to_pixel(target.pixel_to_ray(lattice) @ turn) - lattice, nan=-1e4)
     way = between_lattice(at.reshape(len(y), len(x), 2), double)
     turned = cv2.remap(
-        _resized(image, double).astype(np.float32),
+        resized(image, double).astype(np.float32),
         way[..., 0],
         way[..., 1],
         cv2.INTER_LINEAR,
@@ -219,7 +219,8 @@ def _lattice_places(
     return pixels, places
 
 
-def _resized(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+def resized(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return an image at a width and height that are no larger; itself where it has them."""
     if image.shape[::-1] == size:
         return image
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from detector.camera_model import CameraModel
 from detector.dense_flow import turned_picture
-from detector.parallax.depth_sweep import SweptDepth
+from detector.parallax.depth_sweep import SweptDepth, resized
 from detector.parallax.params import ParallaxParams
 from detector.rotation import fit_rotation, rotation_matrix
 
@@ -70,6 +70,32 @@ class FlowField:
     camera: CameraModel
     swept: SweptDepth | None = None
 
+    @classmethod
+    def of_reduced(
+        cls,
+        reduction: int,
+        later_px: NDArray[np.floating],
+        earlier_px: NDArray[np.floating],
+        information: NDArray[np.float64],
+        later_from_earlier: NDArray[np.float64],
+        textured: NDArray[np.bool_],
+        believed: NDArray[np.bool_],
+        camera: CameraModel,
+        swept: SweptDepth | None = None,
+    ) -> FlowField:
+        """Return the field of what was measured in pictures so many times smaller (:func:`reduced_pair`)."""
+        offset = 0.5 * (reduction - 1)
+        return cls(
+            later_px=later_px.astype(np.float64) * reduction + offset,
+            earlier_px=earlier_px.astype(np.float64) * reduction + offset,
+            information=information / reduction**2,
+            later_from_earlier=np.asarray(later_from_earlier, np.float64),
+            textured=textured,
+            believed=believed,
+            camera=camera,
+            swept=swept,
+        )
+
     def __len__(self) -> int:
         return len(self.later_px)
 
@@ -106,17 +132,14 @@ def measure_flow(
     params
         Settings.
     """
-    reduction = max(1, round(later.shape[1] / params.width_px))
-    size = (later.shape[1] // reduction, later.shape[0] // reduction)
-    small = camera.scaled_to(*size) if reduction > 1 else camera
-    before, now = (earlier, later) if reduction == 1 else (_reduced(earlier, size), _reduced(later, size))
+    before, now, small, reduction = reduced_pair(earlier, later, camera, params.width_px)
     turn = coarse_rotation(before, now, small) if later_from_earlier is None else later_from_earlier
     turned, seen = turned_picture(before, small, turn)
 
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     back = np.asarray(search.calc(now, turned, None), np.float32)  # type: ignore[call-overload]  # no start is allowed
     forth = np.asarray(search.calc(turned, now, None), np.float32)  # type: ignore[call-overload]
-    at = sample_grid(size, params.step_px)
+    at = sample_grid((small.width_px, small.height_px), params.step_px)
     column, row = at.T.astype(np.intp)
     information, strongest = texture(now, column, row, grey_noise(now), params)
     textured = strongest > 1.0 / params.informative_sigma_px**2
@@ -132,16 +155,18 @@ def measure_flow(
         limit = (params.round_trip_px / params.flow_sigma_px) ** 2
         returned = np.einsum("ni,nij,nj->n", missed, information[textured], missed) < limit
         believed[textured] = returned & (inside.reshape(-1) > 0)
-    offset = 0.5 * (reduction - 1)
-    return FlowField(
-        later_px=at.astype(np.float64) * reduction + offset,
-        earlier_px=found.astype(np.float64) * reduction + offset,
-        information=information / reduction**2,
-        later_from_earlier=np.asarray(turn, np.float64),
-        textured=textured,
-        believed=believed,
-        camera=camera,
-    )
+    return FlowField.of_reduced(reduction, at, found, information, turn, textured, believed, camera)
+
+
+def reduced_pair(
+    earlier: NDArray[np.uint8], later: NDArray[np.uint8], camera: CameraModel, width_px: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], CameraModel, int]:
+    """Return both pictures at about a width, their camera, and how many times smaller they are: a whole number, 1 where they are small enough."""
+    reduction = max(1, round(later.shape[1] / width_px))
+    if reduction == 1:
+        return earlier, later, camera, 1
+    size = (later.shape[1] // reduction, later.shape[0] // reduction)
+    return resized(earlier, size), resized(later, size), camera.scaled_to(*size), reduction
 
 
 def coarse_rotation(
@@ -160,11 +185,8 @@ def coarse_rotation(
     -------
     (3, 3) ``later_from_earlier``; none at all where there is too little texture.
     """
-    reduction = max(1, round(later.shape[1] / _COARSE_WIDTH_PX))
-    size = (later.shape[1] // reduction, later.shape[0] // reduction)
-    small = camera.scaled_to(*size)
-    before, now = _reduced(earlier, size), _reduced(later, size)
-    at = sample_grid(size, _COARSE_STEP_PX)
+    before, now, small, _ = reduced_pair(earlier, later, camera, _COARSE_WIDTH_PX)
+    at = sample_grid((small.width_px, small.height_px), _COARSE_STEP_PX)
     column, row = at.T.astype(np.intp)
     strength = cv2.cornerMinEigenVal(now, 7, ksize=3)[row, column]
     chosen = strength > np.quantile(strength, 0.4)
@@ -210,7 +232,7 @@ def _by_shift(
     """Return the yaw and pitch that shift one picture onto the other (phase correlation): a turn of 15 degrees is too far for flow."""
     reduction = max(1, round(later.shape[1] / _SHIFT_WIDTH_PX))
     size = (later.shape[1] // reduction, later.shape[0] // reduction)
-    before, now = (_reduced(image, size).astype(np.float32) for image in (earlier, later))
+    before, now = (resized(image, size).astype(np.float32) for image in (earlier, later))
     window = cv2.createHanningWindow(size, cv2.CV_32F)
     (right, down), _ = cv2.phaseCorrelate(before, now, window)
     middle = np.array([camera.cx_px, camera.cy_px])
@@ -309,9 +331,3 @@ def sample_grid(size: tuple[int, int], step_px: int) -> NDArray[np.float32]:
     half = step_px // 2
     columns, rows = np.meshgrid(np.arange(half, size[0], step_px), np.arange(half, size[1], step_px))
     return np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float32)
-
-
-def _reduced(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    if (image.shape[1], image.shape[0]) == size:
-        return image
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from detector.camera_model import CameraModel
 from detector.parallax.depth_sweep import SweptDepth, between_lattice
 from detector.parallax.egomotion import Egomotion
-from detector.parallax.flow_field import LK_WINDOW_PX, FlowField, grey_noise, sample_grid, texture
+from detector.parallax.flow_field import (
+    LK_WINDOW_PX,
+    FlowField,
+    grey_noise,
+    reduced_pair,
+    sample_grid,
+    texture,
+)
 from detector.parallax.params import ParallaxParams
 
 _LATTICE_PX: Final = 8
@@ -48,17 +55,8 @@ def measure_guided_flow(
     params
         Settings.
     """
-    reduction = max(1, round(later.shape[1] / params.width_px))
-    size = (later.shape[1] // reduction, later.shape[0] // reduction)
-    small = camera.scaled_to(*size) if reduction > 1 else camera
-    before, now = (
-        (earlier, later)
-        if reduction == 1
-        else tuple(
-            np.asarray(cv2.resize(each, size, interpolation=cv2.INTER_AREA), np.uint8)
-            for each in (earlier, later)
-        )
-    )
+    before, now, small, reduction = reduced_pair(earlier, later, camera, params.width_px)
+    size = (small.width_px, small.height_px)
     way = _expected(small, motion, swept)
     drawn = _brightened(
         cv2.remap(before, way[..., 0], way[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), now
@@ -92,17 +90,7 @@ def measure_guided_flow(
         # What was out of the earlier picture has no match there, and a tile or a brick that looks like it is no match.
         lost = swept.further_unseen_at(small.pixel_to_ray(seeds.astype(np.float64)))
         believed[textured] = good & inside & seen & ~lost
-    offset = 0.5 * (reduction - 1)
-    return FlowField(
-        later_px=at.astype(np.float64) * reduction + offset,
-        earlier_px=found * reduction + offset,
-        information=information / reduction**2,
-        later_from_earlier=np.asarray(turn, np.float64),
-        textured=textured,
-        believed=believed,
-        camera=camera,
-        swept=swept,
-    )
+    return FlowField.of_reduced(reduction, at, found, information, turn, textured, believed, camera, swept)
 
 
 def _expected(camera: CameraModel, motion: Egomotion, swept: SweptDepth) -> NDArray[np.float32]:

@@ -106,6 +106,28 @@ class ParallaxResult:
     field: FlowField | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class _Pose:
+    """What is told of a pair's motion.
+
+    Attributes
+    ----------
+    attitude_given
+        Whether the rotation is.
+    direction_later
+        (3,) from the earlier to the later position in the later camera's axes, m; None where the camera is not known to have moved far enough for parallax.
+    baseline_m
+        Its length, however short; None where it is not told.
+    level_from_later
+        (3, 3), None where it is not told.
+    """
+
+    attitude_given: bool
+    direction_later: NDArray[np.float64] | None
+    baseline_m: float | None
+    level_from_later: NDArray[np.float64] | None
+
+
 class ParallaxDetector:
     """The parallax method, one call a pair. It keeps nothing between pairs.
 
@@ -195,13 +217,12 @@ class ParallaxDetector:
             return _nothing(fault.reason, fault.detail, Diagnostics(seconds=seconds))
         clock.step("frames")
         camera = intrinsics.camera
-        direction = None
-        if (
-            translation_earlier_m is not None
-            and later_from_earlier is not None
-            and self._moved(translation_earlier_m)
-        ):
-            direction = later_from_earlier @ translation_earlier_m
+        baseline_m = direction = None
+        if translation_earlier_m is not None and later_from_earlier is not None:
+            baseline_m = float(np.linalg.norm(translation_earlier_m))
+            if baseline_m >= self.params.least_baseline_m:
+                direction = later_from_earlier @ translation_earlier_m
+        pose = _Pose(later_from_earlier is not None, direction, baseline_m, level_from_later)
         # Where a pose says which way the camera went, a small picture is enough to make sure of it.
         look = self.params if direction is None else self._small
         coarse = measure_flow(first.image, second.image, camera, later_from_earlier, look)
@@ -209,14 +230,12 @@ class ParallaxDetector:
         glance = estimate_egomotion(
             coarse,
             look,
-            attitude_given=later_from_earlier is not None,
+            attitude_given=pose.attitude_given,
             direction_prior=direction,
         )
         clock.step("first_motion")
         if glance is None:
-            return self._answer(
-                coarse, None, intrinsics, later_from_earlier, translation_earlier_m, level_from_later, clock
-            )
+            return self._answer(coarse, None, intrinsics, pose, clock)
         swept = sweep_depth(
             first.image, second.image, camera, glance.later_from_earlier, glance.direction_later, self.params
         )
@@ -225,18 +244,14 @@ class ParallaxDetector:
             first.image, second.image, camera, coarse.later_from_earlier, glance, swept, self.params
         )
         clock.step("flow")
-        return self._answer(
-            field, glance, intrinsics, later_from_earlier, translation_earlier_m, level_from_later, clock
-        )
+        return self._answer(field, glance, intrinsics, pose, clock)
 
     def _answer(
         self,
         field: FlowField,
         glance: Egomotion | None,
         intrinsics: Intrinsics,
-        later_from_earlier: NDArray[np.float64] | None,
-        translation_earlier_m: NDArray[np.float64] | None,
-        level_from_later: NDArray[np.float64] | None,
+        pose: _Pose,
         clock: _Clock,
     ) -> ParallaxResult:
         params, camera = self.params, intrinsics.camera
@@ -251,25 +266,18 @@ class ParallaxDetector:
             detail = f"{believed} samples were found again, at least {params.least_informative} needed"
             return _nothing(NoDetectionReason.TOO_LITTLE_FLOW, detail, counts, field)
         left_rad = parallax_left_rad(field)
-        baseline_m = None if translation_earlier_m is None else float(np.linalg.norm(translation_earlier_m))
-        # A camera that is known to have moved and sees no parallax looks at something far away.
-        moved = translation_earlier_m is not None and self._moved(translation_earlier_m)
         limit_rad = still_limit_rad(camera, params)
-        if left_rad < limit_rad and not moved:
+        # A camera that is known to have moved and sees no parallax looks at something far away.
+        if left_rad < limit_rad and pose.direction_later is None:
             detail = (
                 f"a turn alone leaves {1e3 * left_rad:.2f} mrad of flow, limit {1e3 * limit_rad:.2f} mrad"
             )
             return _nothing(NoDetectionReason.NO_MOTION, detail, counts, field)
-        direction = (
-            None
-            if translation_earlier_m is None or later_from_earlier is None or not moved
-            else later_from_earlier @ translation_earlier_m
-        )
         motion = estimate_egomotion(
             field,
             params,
-            attitude_given=later_from_earlier is not None,
-            direction_prior=direction,
+            attitude_given=pose.attitude_given,
+            direction_prior=pose.direction_later,
             start=glance,
         )
         clock.step("motion")
@@ -283,10 +291,10 @@ class ParallaxDetector:
         plane = fit_plane(field, params, motion=motion)
         clock.step("plane")
         depths = inverse_depths(field, motion, params)
-        frame_from_later, is_level = flight_frame(level_from_later, camera)
-        samples = ranged_samples(depths, baseline_m=baseline_m, frame_from_later=frame_from_later)
+        frame_from_later, is_level = flight_frame(pose.level_from_later, camera)
+        samples = ranged_samples(depths, baseline_m=pose.baseline_m, frame_from_later=frame_from_later)
         geometry = PairGeometry(
-            camera, motion, plane, depths, samples, baseline_m, frame_from_later, is_level
+            camera, motion, plane, depths, samples, pose.baseline_m, frame_from_later, is_level
         )
         clock.step("ranges")
         estimate = _motion_estimate(geometry, intrinsics, field, left_rad)
@@ -296,9 +304,6 @@ class ParallaxDetector:
         return ParallaxResult(
             decision.answer(diagnostics), _tracks(field, motion), estimate.focus_px, geometry, decision, field
         )
-
-    def _moved(self, translation_m: NDArray[np.float64]) -> bool:
-        return float(np.linalg.norm(translation_m)) >= self.params.least_baseline_m
 
     def _frame(self, name: str, image: NDArray[np.uint8] | Frame) -> Frame:
         if isinstance(image, Frame):

@@ -117,12 +117,11 @@ class Command:
         if state is State.FOLLOW:
             return self._follow(s)
         if state is State.STEER and s.gap is not None:
-            psi = self._evidence.steered_rad(s)
-            _, room_m = self._evidence.seen.clearer(s.gap.azimuth_rad(s.pose), s.pose, s.now_ns)
+            psi, room_m = self._evidence.steered(s)
             longest_m = min(s.gap.left_m(s.pose), _longest_beside(room_m))
             return self._steer(s, psi, self._evidence.free_m(psi, s.pose, s.now_ns), longest_m)
         if state is State.STEER and s.answer is not None:
-            psi = self._evidence.steered_rad(s)
+            psi, _ = self._evidence.steered(s)
             return self._steer(s, psi, self._evidence.void_free_m(s.answer, s))
         if state is State.PROBE:
             here_m = plan.probe_down_m

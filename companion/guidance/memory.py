@@ -86,7 +86,7 @@ class SeenBearings:
         known_m = [
             _remaining_m(bearing, report, pose) for off_rad, bearing, report in off if off_rad <= near_rad
         ]
-        remembered_m = self._near.free_m(azimuth_rad, pose, now_ns)
+        remembered_m = self.remembered_m(azimuth_rad, pose, now_ns)
         if remembered_m is not None:
             known_m.append(remembered_m)
         return min(known_m, default=None)

@@ -329,14 +329,17 @@ class Evidence:
         """Return the free distance known along an azimuth, or None."""
         return self.seen.free_m(azimuth_rad, pose, self.speed_m_s, now_ns)
 
-    def steered_rad(self, s: Situation) -> float:
-        """Return the azimuth that STEER flies along: the gap's, with room beside it, or the void's; as far as it was looked through."""
-        wanted = s.bearing_rad
+    def steered(self, s: Situation) -> tuple[float, float]:
+        """Return the azimuth that STEER flies along, and the room (m) beside it where that is a gap's, else infinite.
+
+        The gap's azimuth, with room beside it, or the void's; as far as it was looked through.
+        """
+        wanted, room_m = s.bearing_rad, math.inf
         if s.gap is not None:
-            wanted, _ = self.seen.clearer(s.gap.azimuth_rad(s.pose), s.pose, s.now_ns)
+            wanted, room_m = self.seen.clearer(s.gap.azimuth_rad(s.pose), s.pose, s.now_ns)
         elif s.answer is not None:
             wanted = s.answer.azimuth_rad
-        return self.ways.further(wanted, s.pose)
+        return self.ways.further(wanted, s.pose), room_m
 
     def void_free_m(self, answer: Answer, s: Situation) -> float | None:
         """Return what is known of the free distance along the answer's direction."""

@@ -140,7 +140,7 @@ class Table:
         if state is State.FOLLOW:
             azimuth = s.bearing_rad
         elif state is State.STEER and (s.gap is not None or s.answer is not None):
-            azimuth = self._evidence.steered_rad(s)
+            azimuth, _ = self._evidence.steered(s)
         else:
             return False
         in_sight = abs(wrap_rad(azimuth - s.look_rad)) <= math.radians(0.5 * self._config.align_deg)

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.config import CameraConfig, DetectorConfig
-from companion.vision.child import FrameObserver, VoidPipeline
+from companion.vision.child import FrameObserver, VoidPipeline, vehicle_of
 from detector.camera_model import CameraModel
 from detector.evaluation.methods import METHODS, Answer, Method, PairInput
 from detector.flow import Tracks
 from detector.frame import Frame, pair_fault
-from detector.observer import ObserverParams, VoidObserver
+from detector.observer import VoidObserver
 from detector.params import DetectorParams
 from detector.pipeline import PairResult
 from detector.results import Detection, Diagnostics, Direction, DirectionKind, NoDetection, NoDetectionReason
@@ -54,14 +54,7 @@ class _RivalPipeline(VoidPipeline):
     """The paper's pipeline with a rival in place of its detector; it measures how far the ways are free as that one does, by flow on a grid."""
 
     def __init__(self, rival: str, detector: DetectorConfig, camera: CameraConfig) -> None:
-        vehicle = ObserverParams(
-            vehicle_width_m=detector.vehicle_width_m,
-            vehicle_height_m=detector.vehicle_height_m,
-            baseline_target_m=detector.baseline_m,
-            baseline_min_m=0.4 * detector.baseline_m,
-            baseline_max_m=1.8 * detector.baseline_m,
-        )
-        super().__init__(DetectorParams.preset(detector.preset), camera, None, vehicle)
+        super().__init__(DetectorParams.preset(detector.preset), camera, None, vehicle_of(detector))
         self._method = rival
 
     def _observer_of(self, model: CameraModel) -> FrameObserver:

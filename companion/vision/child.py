@@ -53,13 +53,7 @@ def build_pipeline(detector: DetectorConfig, camera: CameraConfig) -> VoidPipeli
         calibrated = CameraModel.from_file(camera.file) if camera.file else None
     except CameraError as error:
         raise ConfigError(f"camera.file: {error}") from error
-    vehicle = ObserverParams(
-        vehicle_width_m=detector.vehicle_width_m,
-        vehicle_height_m=detector.vehicle_height_m,
-        baseline_target_m=detector.baseline_m,
-        baseline_min_m=0.4 * detector.baseline_m,
-        baseline_max_m=1.8 * detector.baseline_m,
-    )
+    vehicle = vehicle_of(detector)
     if detector.method == "parallax":
         # Only here: the worker loads one method.
         from companion.vision.parallax_child import ParallaxPipeline, parallax_params
@@ -73,6 +67,17 @@ def build_pipeline(detector: DetectorConfig, camera: CameraConfig) -> VoidPipeli
     except ParamsError as error:
         raise ConfigError(f"detector.params_file: {error}") from error
     return VoidPipeline(params, camera, calibrated, vehicle)
+
+
+def vehicle_of(detector: DetectorConfig) -> ObserverParams:
+    """Return the vehicle's size, and how far apart the frames of a pair are taken."""
+    return ObserverParams(
+        vehicle_width_m=detector.vehicle_width_m,
+        vehicle_height_m=detector.vehicle_height_m,
+        baseline_target_m=detector.baseline_m,
+        baseline_min_m=0.4 * detector.baseline_m,
+        baseline_max_m=1.8 * detector.baseline_m,
+    )
 
 
 class FrameObserver(Protocol):

@@ -89,12 +89,11 @@ def answer_side_by_side(
             begin = timer()
             method.answer(pair)
             seconds[name].append(timer() - begin)
+    size_px = (pair.later.shape[1], pair.later.shape[0])
+    scene = None if known is None else scene_of(known.images, known.pair, size_px)
     found = []
     for name, answer in answers.items():
         took_s = float(np.median(seconds[name]))
-        verdict = None
-        if known is not None:
-            size = (pair.later.shape[1], pair.later.shape[0])
-            verdict = judge(answer, known.pair, scene_of(known.images, known.pair, size), took_s)
+        verdict = None if known is None or scene is None else judge(answer, known.pair, scene, took_s)
         found.append(MethodAnswer(name, answer, took_s, verdict))
     return tuple(found)
